@@ -27,6 +27,7 @@ from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_run
 from barsight.yard.bundles.strapped_bundles import _as_pack, _covered, _may_go_on
 from barsight.yard.types import DoubtKind, HeightMap
 from lift_yards import laid, record
+from yard_maps import Laid, draw, photographed
 
 CELL = 0.01
 LENGTH_M, WIDE_M = 5.0, 1.2
@@ -85,6 +86,21 @@ def test_straps_tell_touching_bundles_apart(seed: int) -> None:
         assert u + pack.low_m == pytest.approx(low, abs=1.6 * CELL)
         assert u + pack.high_m == pytest.approx(high, abs=1.6 * CELL)
         assert len(pack.span.rows_m) == 3
+
+
+@pytest.mark.parametrize(("count", "seed"), [(2, 0), (3, 1), (4, 0)])
+def test_slim_bundles_side_by_side_are_no_triangles_of_thick_bars(count: int, seed: int) -> None:
+    """Half of them were lost: two crests 144 mm apart look like two bars of 137 mm on a third one."""
+    beside = [Laid(0.3 + 0.144 * k, 0.0, 0.3, 0.0, 0.04, 7, 5.0, 0.0) for k in range(count)]
+    heights = photographed(draw(beside, (-0.3, 1.4), (-2.8, 2.8), seed=seed), beside, blur_m=0.02)
+    y, x = np.meshgrid(heights.y_m, heights.x_m, indexing="ij")
+    assert heights.gray is not None
+    for k, one in enumerate(beside):
+        for at in (-1.9, -0.6, 0.7, 2.0):
+            heights.gray[np.isfinite(one.over(x, y)) & (np.abs(y - at - 0.3 * (k % 3)) < 0.016)] = 20
+    found = find_bundles(heights, BundleSettings())
+    assert [b.centre_m[0] for b in found] == pytest.approx([one.x_m for one in beside], abs=0.006)
+    assert [b.width_m for b in found] == pytest.approx([0.12] * count, abs=0.04)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -42,7 +42,15 @@ from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.packs import strapped_pack
-from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
+from barsight.yard.bundles.set_packing import (
+    NARROWER,
+    best_intervals,
+    choose_readings,
+    holds_several,
+    overlaps,
+    strongest_rivals,
+    without_slivers,
+)
 from barsight.yard.bundles.strapped_bundles import without_pieces
 from barsight.yard.sections import split_map
 from barsight.yard.thin_lines import with_thin_lines
@@ -155,8 +163,28 @@ def _settled(
     found: list[FittedOutline], weights: Float64, claims: list[Int64], height_map: HeightMap,
     settings: BundleSettings,
 ) -> list[Reading]:  # fmt: skip
-    """Select the best set of readings twice: first by themselves, then with regard to the kinds of bundles
-    in the first set.
+    """Select the best set of readings. Those that straps show to be several bundles, which narrower readings
+    explain nearly as well, are left out, and the others are selected anew.
+    """
+    widths, weights = np.array([one.fit.width_m for one in found]), weights.copy()
+    while True:
+        chosen, readings = _selected(found, weights, claims, height_map, settings)
+        split = [
+            k
+            for k, reading in zip(chosen.tolist(), readings, strict=True)
+            if reading.ends_inside and holds_several(k, widths, weights, claims)
+        ]
+        if not split:
+            return [one for one in readings if one.pack is not None or not one.is_flat]
+        weights[split] = 0.0
+
+
+def _selected(
+    found: list[FittedOutline], weights: Float64, claims: list[Int64], height_map: HeightMap,
+    settings: BundleSettings,
+) -> tuple[Int64, list[Reading]]:  # fmt: skip
+    """Select readings twice: first by themselves, then with regard to the kinds of bundles in the first set.
+    Also return their indices.
 
     The packing of each outline is settled by the photo where that shows the bars, otherwise by its
     neighbours.
@@ -188,8 +216,7 @@ def _settled(
     packs = ordered_map(
         lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
-    seen = [replace(one, pack=pack).with_flanks() for one, pack in zip(readings, packs, strict=True)]
-    return [one for one in seen if one.pack is not None or not one.is_flat]
+    return chosen, [replace(one, pack=pack).with_flanks() for one, pack in zip(readings, packs, strict=True)]
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:
@@ -261,40 +288,26 @@ def _seed(candidate: BundleCandidate, row: int, rows: int, grid: AlignedMap, set
 
 
 def _worth_growing(guesses: list[BundleCandidate]) -> list[BundleCandidate]:
-    """Select the best set of candidates that don't overlap, and other packings that explain the same places
-    nearly as well.
+    """Select the best set of candidates that don't overlap, other packings that explain the same places
+    nearly as well, and narrower candidates side by side that do so in the place of a wide one.
     """
     if not guesses:
         return []
-    u, gain = np.array([(g.u_m, g.gain) for g in guesses]).T
-    reach = 0.45 * np.array([bundle_width(g.rings, g.diameter_m) for g in guesses])
-    best = _best_intervals(u - reach, u + reach, gain - _EDGE_CELLS)
-    kept = [guesses[k] for k in best]
+    u, gain, width = np.array([(g.u_m, g.gain, bundle_width(g.rings, g.diameter_m)) for g in guesses]).T
+    reach = 0.45 * width
+    best = best_intervals(u - reach, u + reach, gain - _EDGE_CELLS)
+    kept = list(best)
     for k in best:
+        inner = np.flatnonzero((width < NARROWER * width[k]) & (np.abs(u - u[k]) < width[k] / 2))
+        beside = best_intervals(u[inner] - reach[inner], u[inner] + reach[inner], gain[inner] - _EDGE_CELLS)
+        if len(beside) > 1 and gain[inner][beside].sum() > _RIVAL_RATIO * gain[k]:
+            kept += inner[beside].tolist()
         seen = {guesses[k].rings}
         for n in np.flatnonzero((np.abs(u - u[k]) < reach[k]) & (gain > _RIVAL_RATIO * gain[k])):
             if guesses[n].rings not in seen:
-                kept.append(guesses[n])
+                kept.append(int(n))
                 seen.add(guesses[n].rings)
-    return kept
-
-
-def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
-    """Solve weighted interval scheduling: find the disjoint intervals with the largest total weight."""
-    order = np.argsort(high, kind="stable")
-    before = np.searchsorted(high[order], low[order], side="right")
-    total = np.zeros(order.size + 1)
-    for n, k in enumerate(order):
-        total[n + 1] = max(total[n], total[min(before[n], n)] + weight[k])
-    kept, n = [], order.size
-    while n > 0:
-        k = order[n - 1]
-        if total[n] > total[n - 1]:
-            kept.append(int(k))
-            n = int(min(before[n - 1], n - 1))
-        else:
-            n -= 1
-    return kept
+    return [guesses[k] for k in dict.fromkeys(kept)]
 
 
 def _taken(fits: list[Fit], row: int, v_m: float) -> dict[int, list[tuple[float, float, float]]]:

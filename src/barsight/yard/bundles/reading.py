@@ -13,6 +13,8 @@ _SAME_RATIO, _SAME_M = 0.12, 0.005
 """Tolerance between an outline's edges and those of the pack that it describes: a fraction of the width, plus
 a constant (m).
 """
+_BEYOND_RATIO = 0.35
+"""Minimum part of an outline's width beyond a pack's flank that may be another bundle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,18 @@ class Reading:
             return True
         off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
         return off < _SAME_RATIO * width + _SAME_M
+
+    @property
+    def ends_inside(self) -> bool:
+        """Check whether straps show a flank far inside the outline, as where it covers two bundles."""
+        pack, width = self.pack, self.found.fit.width_m
+        if pack is None:
+            return False
+        inside = pack.low_m + width / 2, width / 2 - pack.high_m
+        return any(
+            side is PackSide.SEEN and beyond > _BEYOND_RATIO * width
+            for side, beyond in zip(pack.sides, inside, strict=True)
+        )
 
     @property
     def is_flat(self) -> bool:

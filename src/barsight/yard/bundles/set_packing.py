@@ -8,6 +8,11 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from barsight.core.arrays import Float64, Int64
 
+NARROWER, _INSIDE_RATIO, _NEARLY = 0.65, 0.5, 0.8
+"""Limits for readings that lie side by side in a wider one: maximum width relative to it, minimum share of
+their place that is its too, minimum sum of their weights relative to its own.
+"""
+
 
 def choose_readings(weights: Float64, claims: list[Int64]) -> Int64:
     """Choose the readings (indices) with the largest total weight so that no place is claimed twice.
@@ -29,6 +34,24 @@ def choose_readings(weights: Float64, claims: list[Int64]) -> Int64:
     if solved.x is None:
         raise RuntimeError(f"no choice of readings: {solved.message}")
     return np.array(useful, np.int64)[np.flatnonzero(solved.x > 0.5)]
+
+
+def best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
+    """Solve weighted interval scheduling: find the disjoint intervals with the largest total weight."""
+    order = np.argsort(high, kind="stable")
+    before = np.searchsorted(high[order], low[order], side="right")
+    total = np.zeros(order.size + 1)
+    for n, k in enumerate(order):
+        total[n + 1] = max(total[n], total[min(before[n], n)] + weight[k])
+    kept, n = [], order.size
+    while n > 0:
+        k = order[n - 1]
+        if total[n] > total[n - 1]:
+            kept.append(int(k))
+            n = int(min(before[n - 1], n - 1))
+        else:
+            n -= 1
+    return kept
 
 
 def without_slivers(claims: list[Int64], min_ratio: float) -> list[Int64]:
@@ -82,6 +105,17 @@ def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[i
     rated = np.where(wants & (weights > 0), weights, 0.0)
     best = rated.argmax(axis=1)
     return [int(k) if rated[row, k] > 0 else None for row, k in enumerate(best)]
+
+
+def holds_several(k: int, widths_m: Float64, weights: Float64, claims: list[Int64]) -> bool:
+    """Check whether several narrower readings side by side explain the place of reading k nearly as well."""
+    inside = [
+        j
+        for j in np.flatnonzero((widths_m < NARROWER * widths_m[k]) & (weights > 0)).tolist()
+        if np.isin(claims[j], claims[k], assume_unique=True).sum() > _INSIDE_RATIO * claims[j].size
+    ]
+    best = choose_readings(weights[inside], [claims[j] for j in inside])
+    return best.size > 1 and bool(weights[inside][best].sum() > _NEARLY * weights[k])
 
 
 def _owners(claims: list[Int64]) -> tuple[Int64, Int64]:
