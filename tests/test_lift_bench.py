@@ -32,10 +32,14 @@ from barsight.simulation.worlds.packing import tag
 from barsight.simulation.worlds.solids import SolidYard, cylinder
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.checks import face_checks
 from barsight.yard.lifting.clearance import FacePlane
-from barsight.yard.lifting.labels import find_label
+from barsight.yard.lifting.labels import find_labels, rests_on_label
+from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.holding import hold_load
+from lift_yards import laid, record
 
 
 @pytest.mark.parametrize("seed", [5, 7])
@@ -73,18 +77,50 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
     assert table.row_count == 11
 
 
+def layer_with_label(diameter_m: float, along_m: float | None) -> DrawnYard:
+    """A flat layer of bars on the floor, perhaps with a label on the middle one."""
+    radius, along = diameter_m / 2, np.array([0.0, 1.0, 0.0])
+    cross = np.array([(k * diameter_m, radius) for k in range(-4, 5)])
+    solids = [cylinder("bar", np.array([x, 0.0, z]), along, radius, 5.7, 0) for x, z in cross]
+    solids += [] if along_m is None else [tag(cross[4:5], radius, along_m * along, np.eye(3), 0)]
+    return DrawnYard(0, "row", SolidYard(tuple(solids)), (), (0.4, 6.0))
+
+
 def test_a_label_that_would_hold_the_faces_off_shows_in_the_photo() -> None:
-    cross = np.array([(-0.09, 0.045), (0.0, 0.045), (0.09, 0.045)])
-    along = np.array([0.0, 1.0, 0.0])
-    bars = [cylinder("bar", np.array([x, 0.0, z]), along, 0.045, 5.7, 0) for x, z in cross]
-    label = tag(cross[1:2], 0.045, 0.7 * along, np.eye(3), 0)
     found = []
-    for solids in (bars, [*bars, label]):
-        world = DrawnYard(0, "row", SolidYard(tuple(solids)), (), (0.4, 6.0))
-        height_map = noisy_world(world, LiftSettings()).scene.heights
+    for along_m in (None, 0.7):
+        height_map = noisy_world(layer_with_label(0.09, along_m), LiftSettings()).scene.heights
         place, plane = Placement(0.0, 0.0, 0.0), FacePlane(0.09, 0.0, 0.0, 0.002)
-        found.append(find_label(place, height_map, load_magnet(None), plane))
-    assert found[0] is None and found[1] == pytest.approx((0.7, 0.0), abs=0.05)
+        found.append(find_labels(place, height_map, load_magnet(None), plane))
+    assert not found[0] and found[1][0].place_under(place) == pytest.approx((0.7, 0.0), abs=0.05)
+
+
+@pytest.mark.parametrize("along_m", [0.7, 2.3])
+@pytest.mark.parametrize("diameter_m", [0.025, 0.05, 0.09])
+def test_faces_on_a_label_pull_and_touch_no_less_than_is_told(
+    tmp_path: Path, diameter_m: float, along_m: float
+) -> None:
+    described = tmp_path / "magnet.toml"
+    described.write_text(example_magnet(), encoding="utf-8")
+    magnet, settings, world = load_magnet(described), LiftSettings(), layer_with_label(diameter_m, along_m)
+    scene, judge = noisy_world(world, settings).scene, Judge(world.yard, read_magnet(described))
+    load = (record(laid(0.0), bar_diameter_m=diameter_m, bars=None),)
+    for off_m in (-0.03, 0.0, 0.012):
+        place = Placement(off_m, 0.0, 0.0)
+        bare = rest_magnet(scene.heights, place, magnet, settings.contact_gap_m)
+        assert bare is not None
+        (label,) = find_labels(place, scene.heights, magnet, FacePlane.of(bare))
+        told = []
+        for contact in rests_on_label(label, place, scene.heights, magnet, settings):
+            held = hold_load(contact, magnet, load, settings.strap_m)
+            (share,) = (
+                c for c in face_checks(held, 1.0, magnet, load, settings) if c.what.startswith("share")
+            )
+            told.append((held.pull_low_n, share.value - share.sigma))
+        verdict = judge.judge(Target(off_m, 0.0, 0.0, (0.0, 0.0, 0.0)))
+        pull_n, least = np.min(told, axis=0)
+        assert 0 < pull_n <= verdict.pull_n and pull_n < hold_load(bare, magnet, load, 0.0012).pull_low_n
+        assert 0 < least <= -verdict.figures["share on the load"]
 
 
 def test_placements_for_danger_say_nothing_of_what_is_refused(tmp_path: Path) -> None:

@@ -11,13 +11,13 @@ from scipy import ndimage
 
 from barsight.yard.lifting import labels
 from barsight.yard.lifting.clearance import FacePlane
-from barsight.yard.lifting.labels import find_label
+from barsight.yard.lifting.labels import find_labels, rests_on_label
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.plates import plate_masks
 from barsight.yard.types import HeightMap
-from lift_yards import MAGNET, codes, judged, laid, map_of, record
+from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
 PLACE = Placement(0.3, 0.0, 0.0)
 
@@ -55,12 +55,58 @@ def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
     label = np.ix_(np.abs(heights.y_m - y_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
     gray[label] = 250.0
     heights = replace(heights, gray=np.clip(gray, 1, 255).astype(np.uint8))
-    found = find_label(PLACE, heights, MAGNET, plane(PLACE, heights))
-    assert (found is not None) == under
-    if found is not None:
-        assert found[0] == pytest.approx(y_m, abs=0.03) and found[1] == pytest.approx(0.0, abs=0.02)
+    found = find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))
+    assert len(found) == under
+    for one in found:
+        assert one.place_under(PLACE) == pytest.approx((y_m, 0.0), abs=0.01)
+        assert (one.half_along_m, one.half_across_m) == pytest.approx((0.033, 0.02), abs=0.011)
+        assert one.steel_z_m == pytest.approx(laid(0.3).top_z_m, abs=0.004) and one.own_z_m < one.steel_z_m
     lift = judged([laid(0.3)], (record(laid(0.3)),), PLACE, heights=heights)
     assert codes(lift) == ({"gap"} if under else set())
+
+
+@pytest.mark.parametrize(
+    ("diameter_m", "labels_m", "thick_m", "told"),
+    [
+        (0.03, (), 0.003, ""),
+        (0.03, (-2.1,), 0.003, ""),
+        (0.03, (-2.1,), 0.006, "of the faces count as in contact"),
+        (0.03, (-2.1, 0.7), 0.003, "several labels"),
+        (0.09, (-2.1,), 0.003, "of the faces count as in contact"),
+    ],
+)
+def test_thin_bars_are_held_on_one_label_and_the_pull_on_it_is_told(
+    diameter_m: float, labels_m: tuple[float, ...], thick_m: float, told: str
+) -> None:
+    bundle = laid(0.3, bars=61, diameter_m=0.03) if diameter_m == 0.03 else laid(0.3)
+    heights = map_of([bundle], x_m=(-1.5, 2.0), sigma_m=0.0005)
+    gray = np.full(heights.shape, 90, np.uint8)
+    for y_m in labels_m:
+        gray[np.ix_(np.abs(heights.y_m - y_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)] = 250
+    settings = replace(SETTINGS, label_m=thick_m)
+    bare, lift = (
+        judged([bundle], place=PLACE, settings=settings, heights=replace(heights, gray=photo))
+        for photo in (np.full(heights.shape, 90, np.uint8), gray)
+    )
+    assert codes(bare) == set() and bare.contact is not None and lift.contact is not None
+    assert bool(codes(lift)) == bool(told) and all(told in veto.reason for veto in lift.vetoes)
+    if labels_m and not told:
+        assert lift.contact.pull_low_n < 0.97 * bare.contact.pull_low_n and lift.safety < bare.safety
+
+
+def test_a_plate_is_at_least_as_thick_as_the_map_shows() -> None:
+    heights = map_of([laid(0.3, bars=61, diameter_m=0.03)], x_m=(-1.5, 2.0))
+    at = np.ix_(np.abs(heights.y_m - MAGNET.poles[0].along_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
+    gray, z_m = np.full(heights.shape, 90, np.uint8), heights.z_m.copy()
+    gray[at] = 250
+    z_m[at] += 0.009
+    flat = replace(heights, gray=gray)
+    highest = []
+    for shown in (flat, replace(flat, z_m=z_m)):
+        (label,) = find_labels(PLACE, shown, MAGNET, plane(PLACE, shown))
+        rests = rests_on_label(label, PLACE, shown, MAGNET, SETTINGS)
+        highest.append(max(contact.centre_z_m for contact in rests))
+    assert highest[1] - highest[0] > 0.001
 
 
 @pytest.mark.parametrize("half_m", [(0.03, 0.05), (0.05, 0.03)], ids=["along", "across"])
@@ -77,9 +123,9 @@ def test_a_label_with_a_code_forbids(half_m: tuple[float, float]) -> None:
     assert codes(judged([laid(0.3)], (record(laid(0.3)),), PLACE, heights=heights)) == {"gap"}
     between = (MAGNET.poles[0].along_m + MAGNET.poles[1].along_m) / 2
     beside = replace(PLACE, y_m=at_m - between)
-    assert find_label(beside, heights, MAGNET, plane(beside, heights)) is None
+    assert not find_labels(beside, heights, MAGNET, plane(beside, heights))
     over = replace(plane(PLACE, heights), centre_z_m=plane(PLACE, heights).centre_z_m + 0.03)
-    assert find_label(PLACE, heights, MAGNET, over) is None, "it lies 30 mm below the faces"
+    assert not find_labels(PLACE, heights, MAGNET, over), "it lies 30 mm below the faces"
 
 
 def test_an_askew_label_on_a_bright_bar_is_found_and_a_gleam_is_not() -> None:
@@ -144,7 +190,7 @@ def test_a_bright_floor_beside_a_narrow_load_hides_no_label() -> None:
     at_m = MAGNET.poles[0].along_m
     gray[np.ix_(np.abs(heights.y_m - at_m) < 0.025, np.abs(heights.x_m - 0.3) < 0.02)] = 160.0
     heights = replace(heights, gray=gray.astype(np.uint8))
-    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+    assert find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))
 
 
 @pytest.mark.parametrize("askew_deg", [0.6, 1.1])
@@ -158,7 +204,7 @@ def test_bars_a_little_askew_bear_no_label(askew_deg: float) -> None:
     gray[np.abs(np.mod(v, 0.5) - 0.25) < 0.02] = 60.0
     heights = replace(heights, gray=gray.astype(np.uint8))
     place = replace(PLACE, yaw_rad=yaw)
-    assert find_label(place, heights, MAGNET, plane(place, heights)) is None
+    assert not find_labels(place, heights, MAGNET, plane(place, heights))
 
 
 def test_a_strap_is_no_code() -> None:
@@ -184,7 +230,7 @@ def test_a_label_that_ends_beside_a_face_counts_two_cells_further(beside_m: floa
     rows = (heights.y_m <= far + 1e-6) & (heights.y_m > far - 0.06)
     gray[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.03)] = 250.0
     heights = replace(heights, gray=gray.astype(np.uint8))
-    assert (find_label(PLACE, heights, exact, plane(PLACE, heights)) is not None) == found
+    assert bool(find_labels(PLACE, heights, exact, plane(PLACE, heights))) == found
 
 
 @pytest.mark.parametrize("exposure", [1.0, 0.5, 0.3])
@@ -195,7 +241,7 @@ def test_a_label_in_an_underexposed_picture_is_found(exposure: float) -> None:
         250
     )
     heights = replace(heights, gray=np.clip(exposure * gray, 1, 255).astype(np.uint8))
-    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+    assert find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))
 
 
 @pytest.mark.parametrize(("cells", "may_hide"), [(3, True), (2, False)])
@@ -213,4 +259,4 @@ def test_a_code_on_steel_as_bright_as_its_paper_is_found_in_a_dark_picture(expos
     gray[:, across < 0.14] = 225.0
     gray[np.ix_(along < 0.024, across < 0.024)] = 140.0
     heights = replace(heights, gray=np.rint(exposure * gray).astype(np.uint8))
-    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+    assert find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))

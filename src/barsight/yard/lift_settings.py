@@ -27,6 +27,8 @@ class LiftSettings:
     """Maximum gap between a face and the steel for the face to lie on it."""
     strap_m: float = 0.0012
     """Maximum thickness of a strap, which may hold a face off the bars."""
+    label_m: float = 0.003
+    """Maximum thickness of a label on the bars, which may lie on a strap; 0 if no label holds a face off."""
     max_hidden_bar_m: float = 0.022
     """Maximum diameter of a bar across a load that the pictures may be too coarse to show."""
     max_refused_ratio: float = 0.5
@@ -66,7 +68,7 @@ class LiftSettings:
         expect_ranges(
             self, "lift.", bundles=(1, 10), max_unknown_ratio=SHARE, max_unexplained_ratio=SHARE,
             min_confidence=SHARE, max_overhang_ratio=SHARE, min_count_probability=SHARE,
-            max_refused_ratio=SHARE, strap_m=(0, 0.05), max_hidden_bar_m=(OVER_0, 0.1),
+            max_refused_ratio=SHARE, strap_m=(0, 0.05), label_m=(0, 0.012), max_hidden_bar_m=(OVER_0, 0.1),
             contact_gap_m=POSITIVE, max_age_s=POSITIVE, beside_stanchion_m=POSITIVE,
             disturbed_reach_m=(0, 100), set_down_clear_m=POSITIVE, travel_clear_m=POSITIVE,
             swing_m=POSITIVE, dunnage_m=(0, 0.5), max_turn_deg=(0, 180), max_stack_m=(OVER_0, 50),

@@ -35,8 +35,8 @@ VETOES = {
     "narrow-tolerance": "A check fails elsewhere within the crane's tolerance.",
     "obstructed": "Something stands above the plane of the faces, under or beside the magnet.",
     "tilt": "The faces slope too much along the beam, or touch too far beside their middle.",
-    "gap": "A pole is too far above the steel, too little of the faces touches it, a label is between "
-    "them, or the height of the steel is too uncertain.",
+    "gap": "A pole is too far above the steel, too little of the faces touches it, a label may hold them off "
+    "too far, or the height of the steel is too uncertain.",
     "weak-pull": "The lower bound of the pull, in all or at one pole, is less than the load times the "
     "safety factor needs, or the load hangs so far beside it that it may pry the faces off.",
     "mass-unknown": "The mass can't be determined from what was seen.",

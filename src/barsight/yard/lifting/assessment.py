@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from barsight.yard.lifting.clearance import (
     leaning_checks,
     resting_checks,
 )
-from barsight.yard.lifting.labels import label_checks
+from barsight.yard.lifting.labels import SeenLabel, find_labels, rests_on_label
 from barsight.yard.lifting.lift import Lift, LiftScene
 from barsight.yard.lifting.thin_bars import (
     beside_checks,
@@ -59,11 +59,49 @@ from barsight.yard.magnet.seen_edges import seen_clearances
 from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.stability.stability import footing_checks
 from barsight.yard.types import Bundle, HeightMap, known_sigma
-from barsight.yard.vetoes import check_min, check_true, vetoes_of
+from barsight.yard.vetoes import Check, check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre
 
 SCALES = (1.0, 1.5, 2.5)
 """Multiples of the crane's tolerance that are tried as the box within which a lift remains as checked."""
+SEVERAL = "several labels or other bright plates may be under the faces"
+ON_LABEL = "if the faces rest on a label or another bright plate"
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """Hold of a load by resting faces: their contact with its pull, the weakest pole, `pried_ratio` and
+    `weakest_bundle`.
+    """
+
+    contact: Contact
+    weakest: WeakestPole | None
+    pried: float
+    worst: float
+
+    @classmethod
+    def of(
+        cls, contact: Contact, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
+        settings: LiftSettings,
+    ) -> Hold:  # fmt: skip
+        """Compute it from a contact without a pull."""
+        contact = hold_load(contact, magnet, load, settings.strap_m)
+        return cls(
+            contact, weakest_pole(contact, needed_n, magnet, place, load),
+            pried_ratio(contact, needed_n, magnet, place, load),
+            weakest_bundle(contact, magnet, place, load, settings.strap_m),
+        )  # fmt: skip
+
+    def checks(
+        self, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
+        settings: LiftSettings,
+    ) -> list[Check]:  # fmt: skip
+        """Check how the faces lie and pull, and that they rest on the load."""
+        return [
+            *face_checks(self.contact, needed_n, magnet, load, settings),
+            *share_checks(self.weakest, self.pried, self.worst),
+            *resting_checks(place, magnet, self.contact, load),
+        ]
 
 
 def assess_placement(
@@ -79,10 +117,8 @@ def assess_placement(
     valid = validity(yard.travel, place, magnet, load, yard.heights, settings) if yard.travel else None
     mass = _load_mass(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
-    contact = hold_load(contact, magnet, load, settings.strap_m)
-    weakest = weakest_pole(contact, needed, magnet, place, load)
-    pried = pried_ratio(contact, needed, magnet, place, load)
-    worst = weakest_bundle(contact, magnet, place, load, settings.strap_m)
+    hold = Hold.of(contact, place, magnet, load, needed, settings)
+    contact = hold.contact
     away = np.array([place.x_m, place.y_m]) - load_centre(load)
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
@@ -92,16 +128,15 @@ def assess_placement(
         *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
-        *face_checks(contact, needed, magnet, load, settings),
-        *share_checks(weakest, pried, worst),
+        *hold.checks(place, magnet, load, needed, settings),
         *clearance_checks(place, yard.heights, magnet, contact, load, settings.stanchions),
-        *resting_checks(place, magnet, contact, load),
         *leaning_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
     if not vetoes_of(checks):
-        checks += label_checks(place, yard.heights, magnet, FacePlane.of(contact))
+        hold, on_label = _on_label(hold, place, yard, magnet, load, needed, settings)
+        checks += on_label
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
         if has_pictures(yard.heights, pixel_m):
@@ -118,14 +153,44 @@ def assess_placement(
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
-        contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
+        hold.contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         _scaled(magnet.tolerance, scale),
-        _safety(contact, weakest, needed, mass, magnet, (scale if search else math.inf, pried, worst)),
+        _safety(hold, needed, mass, magnet, scale if search else math.inf),
         tuple(checks), valid, target_covariance(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel,
             magnet.offset,
         ),
     )  # fmt: skip
+
+
+def _on_label(
+    hold: Hold, place: Placement, yard: LiftScene, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
+    settings: LiftSettings,
+) -> tuple[Hold, list[Check]]:  # fmt: skip
+    """Check that the faces hold the load wherever a label under one may bear them; with the weakest hold."""
+    if yard.heights.gray is None:
+        return hold, []
+    labels = find_labels(place, yard.heights, magnet, FacePlane.of(hold.contact))
+    reason = SEVERAL if len(labels) > 1 else ""
+    rests = (rests_on_label(label, place, yard.heights, magnet, settings) for label in labels[:1])
+    for contact in itertools.chain.from_iterable(() if reason else rests):
+        one = Hold.of(contact, place, magnet, load, needed_n, settings)
+        failed = vetoes_of([
+            *one.checks(place, magnet, load, needed_n, settings),
+            *clearance_checks(place, yard.heights, magnet, one.contact, load, settings.stanchions),
+            *leaning_checks(place, magnet, one.contact, load),
+        ])  # fmt: skip
+        if failed:
+            reason = failed[0].reason
+            break
+        hold = min(hold, one, key=lambda either: either.contact.pull_low_n)
+    if reason:
+        along, across = labels[0].place_under(place)
+        reason = (
+            f"a label or another bright plate is under a face, {along:+.2f} m along and {across:+.2f} m "
+            f"across the beam, and may hold the faces off the bars: {reason}"
+        )
+    return hold, [check_true("gap", "a label under a face leaves the load held", not reason, reason)]
 
 
 def _grip(
@@ -148,20 +213,17 @@ def _unseen_lift(place: Placement) -> Lift:
     return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
 
 
-def _safety(
-    contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet,
-    others: tuple[float, ...],
-) -> float:  # fmt: skip
-    """Compute a lift's safety: the minimum of pull over needed pull, weakest pole's pull over its share,
-    capacity over load, and `others`: tolerance over the crane's, what the load pries off, the worst bundle.
+def _safety(hold: Hold, needed_n: float, mass: Mass, magnet: Magnet, scale: float) -> float:
+    """Compute a lift's safety: the minimum of pull over needed pull, weakest pole's pull over its share, what
+    the load pries off, the worst bundle, capacity over load, and tolerance over the crane's, `scale`.
     """
     capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     ratios = (
-        contact.pull_low_n / needed_n if needed_n > 0 else 0.0,
-        weakest.ratio if weakest else 0.0,
+        hold.contact.pull_low_n / needed_n if needed_n > 0 else 0.0,
+        hold.weakest.ratio if hold.weakest else 0.0,
         capacity_kg / mass.upper_kg if mass.upper_kg > 0 else 0.0,
-        *others,
-    )
+        hold.pried, hold.worst, scale,
+    )  # fmt: skip
     return float(np.nan_to_num(np.min(ratios)))
 
 
@@ -224,12 +286,15 @@ def _tolerance(
         unsure = vetoes_of([probability_check(sure, len(held.gripped), settings)])
         if unsure:
             return found, unsure[0].reason
-        changed = _change(place, box, yard, magnet, near, held, needed_n, settings)
+        wider = replace(magnet, tolerance=box)
+        labels = find_labels(place, yard.heights, wider, FacePlane.of(contact))
+        if len(labels) > 1:
+            return found, SEVERAL
+        changed = _change(place, box, yard, magnet, near, held, needed_n, settings, labels)
         if changed:
             return found, changed
-        wider = replace(magnet, tolerance=box)
         clear = clearance_checks(place, yard.heights, wider, contact, load, settings.stanchions)
-        for veto in vetoes_of([*label_checks(place, yard.heights, wider, FacePlane.of(contact)), *clear]):
+        for veto in vetoes_of(clear):
             return found, veto.reason
         found = scale
     return found, ""
@@ -244,9 +309,11 @@ def _scaled(tolerance: Tolerance, scale: float) -> Tolerance:
 
 def _change(
     place: Placement, box: Tolerance, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip,
-    needed_n: float, settings: LiftSettings,
+    needed_n: float, settings: LiftSettings, labels: tuple[SeenLabel, ...],
 ) -> str:  # fmt: skip
-    """Find what changes at a corner of the box where the faces come to rest there; empty if nothing does."""
+    """Find what changes at a corner of the box where the faces come to rest there, on labels or not; empty if
+    nothing does.
+    """
     load = tuple(near.bundles[k] for k in held.gripped)
     exact = replace(magnet, tolerance=Tolerance(0.0, 0.0, 0.0))
     for dx, dy, dyaw in itertools.product((-1, 1), repeat=3):
@@ -254,26 +321,20 @@ def _change(
             place, x_m=place.x_m + dx * box.x_m, y_m=place.y_m + dy * box.y_m,
             yaw_rad=place.yaw_rad + dyaw * math.radians(box.yaw_deg),
         )  # fmt: skip
-        contact = rest_magnet(yard.heights, moved, magnet, settings.contact_gap_m)
-        if contact is None:
+        bare = rest_magnet(yard.heights, moved, magnet, settings.contact_gap_m)
+        if bare is None:
             return "nothing is known under the magnet"
-        contact = hold_load(contact, magnet, load, settings.strap_m)
-        checks = [
-            unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, load, settings),
-            *share_checks(
-                weakest_pole(contact, needed_n, magnet, moved, load),
-                pried_ratio(contact, needed_n, magnet, moved, load),
-                weakest_bundle(contact, magnet, moved, load, settings.strap_m),
-            ),
-            *resting_checks(moved, magnet, contact, load),
-        ]  # fmt: skip
-        for veto in vetoes_of(checks):
-            return veto.reason
-        # The whole box was checked against the limits with their sigmas; only the resting faces are new here.
-        obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
-        if obstacle is not None:
-            return obstacle.reason
-        there = _grip(moved, yard.heights, magnet, exact.tolerance, near, contact)
+        rests = (rests_on_label(label, moved, yard.heights, magnet, settings) for label in labels)
+        for contact in itertools.chain((bare,), *rests):
+            hold = Hold.of(contact, moved, magnet, load, needed_n, settings)
+            held_checks = hold.checks(moved, magnet, load, needed_n, settings)
+            for veto in vetoes_of([unknown_check(contact, settings), *held_checks]):
+                return veto.reason if contact is bare else f"{ON_LABEL}: {veto.reason}"
+            # The whole box was checked against the limits with their sigmas; only the faces' rest is new.
+            obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
+            if obstacle is not None:
+                return obstacle.reason
+        there = _grip(moved, yard.heights, magnet, exact.tolerance, near, bare)
         if there.gripped != held.gripped:
             return f"the magnet would take {len(there.gripped)} bundles"
     return ""

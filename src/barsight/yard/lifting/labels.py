@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -10,13 +13,15 @@ from scipy import ndimage
 from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.label_settings import LabelSettings
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import FacePlane
+from barsight.yard.magnet.contact import Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.resting_plane import SEGMENT_M
 from barsight.yard.map_lookup import SATURATED_LEVEL, nearest_cells, sample_levels
 from barsight.yard.plates import STEP_M, WHITE_LEVEL, plate_masks
 from barsight.yard.types import HeightMap
-from barsight.yard.vetoes import Check, check_true
 
 SIZE_M = LabelSettings().size_m
 """Size (m) of a usual label; the middle of one with a code is too dark for `mark_labels`."""
@@ -51,41 +56,75 @@ PAPER_RATIO = 2.3
 """Minimum ratio of the level of a code's paper to the orthophoto's median; WHITE_LEVEL is always enough."""
 WHITE_CELLS = 6, 3
 """Size along and across, in steps, of a saturated place that may be a label."""
+_NEAR, _EDGE = round(SEGMENT_M / 2 / STEP_M), round(EDGE_M / STEP_M)
+"""Number of steps along and across around a label whose median heights along the bars are the steel's."""
 _BESIDE = 4
 """Number of steps before and behind a label that are read."""
 _DARK = 10.0
 """Level added to both levels of a ratio, since ratios of very dark levels mean nothing."""
 
 
-def label_checks(place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane) -> list[Check]:
-    """Check that no label lies under a face wherever the crane sets it down within its tolerance; empty
-    without an orthophoto.
+@dataclass(frozen=True)
+class SeenLabel:
+    """Rectangle of a label, or of another bright plate, as it shows: its middle (yard axes, m), half of its
+    length along the beam and of its width across; heights of the steel under it, and of itself as mapped.
+    """
+
+    x_m: float
+    y_m: float
+    half_along_m: float
+    half_across_m: float
+    steel_z_m: float
+    own_z_m: float
+
+    def place_under(self, place: Placement) -> tuple[float, float]:
+        """Return how far (m) along and across the beam its middle is from the magnet's."""
+        along, across = place.beam_axes @ (self.x_m - place.x_m, self.y_m - place.y_m)
+        return float(along), float(across)
+
+
+def rests_on_label(
+    label: SeenLabel, place: Placement, heights: HeightMap, magnet: Magnet, settings: LiftSettings
+) -> Iterator[Contact]:
+    """Yield how the magnet rests where a label is under its faces, for each part that may bear them."""
+    top_z_m = max(label.steel_z_m + settings.label_m, label.own_z_m)
+    for part in _bearing_parts(label, place, magnet):
+        plate = np.column_stack([part, np.full(len(part), top_z_m)])
+        contact = rest_magnet(heights, place, magnet, settings.contact_gap_m, plate)
+        if contact is not None:
+            yield contact
+
+
+def _bearing_parts(label: SeenLabel, place: Placement, magnet: Magnet) -> Iterator[Float64]:
+    """Yield the corners (N, 2), along and across, of what shows of a label under a face; then the middle of
+    each column of it, and of those up to EDGE_M beside it.
+    """
+    middle, half = np.array(label.place_under(place)), np.array([label.half_along_m, label.half_across_m])
+    for pole in magnet.pole_table:
+        low, high = pole[:2] - pole[2:] / 2, pole[:2] + pole[2:] / 2
+        first, last = np.maximum(middle - half, low), np.minimum(middle + half, high)
+        if (first < last).all():
+            yield np.array(list(itertools.product(*zip(first, last, strict=True))))
+        first, last = np.maximum(middle - half - EDGE_M, low), np.minimum(middle + half + EDGE_M, high)
+        if (first < last).all():
+            for column in np.linspace(first[1], last[1], math.ceil((last[1] - first[1]) / STEP_M) + 1):
+                yield np.array([[(first[0] + last[0]) / 2, column]])
+
+
+def find_labels(
+    place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane
+) -> tuple[SeenLabel, ...]:
+    """Find the labels that may come under a face within the crane's tolerance, and are nearly as high as the
+    faces; none without an orthophoto.
     """
     if heights.gray is None:
-        return []
-    found = find_label(place, heights, magnet, plane)
-    reason = ""
-    if found is not None:
-        reason = (
-            f"a label or another bright plate is under a face, {found[0]:+.2f} m along and "
-            f"{found[1]:+.2f} m across the beam: it would hold the faces off the bars"
-        )
-    return [check_true("gap", "no label is under a face", found is None, reason)]
-
-
-def find_label(
-    place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane
-) -> tuple[float, float] | None:
-    """Find a label under the faces that is nearly as high as they are. Returns m along and across the beam;
-    None where there is none.
-    """
+        return ()
     poles, tolerance = magnet.pole_table, magnet.tolerance
     turned = math.radians(tolerance.yaw_deg)
     wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
     long = float(tolerance.along(place.along)) + turned * wide + EDGE_M
     broad = float(tolerance.along(place.across)) + turned * magnet.half_span_m + EDGE_M
     v, u = _steps(magnet.half_span_m + long + BESIDE_M), _steps(wide + broad + BESIDE_M)
-    assert heights.gray is not None
     gray, z_m = _look_up(place, heights, v, u)
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_low = z_m < faces_z_m - DEEP_M
@@ -100,9 +139,26 @@ def find_label(
     for along, across, length, width in poles:
         rows = np.abs(v - along) <= length / 2 + long
         under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad)
-    under &= labels
-    cells = np.argwhere(under)
-    return (float(v[cells[0, 0]]), float(u[cells[0, 1]])) if cells.size else None
+    # A gap of two cells parts no label.
+    numbers, _ = ndimage.label(ndimage.binary_dilation(labels, np.ones((3, 3), np.bool_)), np.ones((3, 3)))
+    found = []
+    for number in np.unique(numbers[under & labels]):
+        at = np.argwhere((numbers == number) & labels)
+        (top, left), (bottom, right) = at.min(axis=0), at.max(axis=0)
+        x_m, y_m = (v[top] + v[bottom], u[left] + u[right]) @ place.beam_axes / 2 + (place.x_m, place.y_m)
+        half_along, half_across = STEP_M / 2 * (bottom - top + 1), STEP_M / 2 * (right - left + 1)
+        about = z_m[max(top - _NEAR, 0) : bottom + _NEAR + 1, max(left - _EDGE, 0) : right + _EDGE + 1]
+        steel_z_m = _highest(about, float(faces_z_m[top, left]))
+        own_z_m = _highest(z_m[top : bottom + 1, left : right + 1], steel_z_m)
+        half_m = float(half_along), float(half_across)
+        found.append(SeenLabel(float(x_m), float(y_m), *half_m, steel_z_m, own_z_m))
+    return tuple(found)
+
+
+def _highest(z_m: Float32, unseen_m: float) -> float:
+    """Find the highest of the columns' medians (V, U) along the bars; `unseen_m` where none is known."""
+    seen = z_m[:, np.isfinite(z_m).any(axis=0)]
+    return float(np.nanmedian(seen, axis=0).max()) if seen.size else unseen_m
 
 
 def _steps(reach_m: float) -> Float64:

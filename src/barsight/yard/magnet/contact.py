@@ -7,12 +7,12 @@ the upper envelope around the middle, or on fewer with the suspension limiting i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import grey_opening
 
-from barsight.core.arrays import Float64, kernel
+from barsight.core.arrays import Float64, frozen, kernel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.resting_plane import (
@@ -34,6 +34,7 @@ HIDING_COLUMNS = 4
 """Minimum number of adjacent unseen columns of `resting_plane.STEP_M` that may hide an obstacle: the strip
 between two bars, where no picture shows the steel, hides nothing.
 """
+NO_PLATE = frozen(np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,7 @@ class Contact:
     error that the whole map shares; gap_sigma_m: of the height over the steel. touch_gap_m: maximum gap at
     which a place of a face touches. pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m:
     the largest of the poles' smallest gaps. contact_share: of all faces; unknown_share: the worst pole's.
+    plate_m: (N, 2) places, along and across, where the faces touch a plate on the steel (`rest_magnet`).
     """
 
     centre_z_m: float
@@ -79,6 +81,7 @@ class Contact:
     gap_sigma_m: float
     touch_gap_m: float
     poles: tuple[PoleContact, ...]
+    plate_m: Float64 = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def pull_n(self) -> float:
@@ -106,10 +109,13 @@ class Contact:
         return max(pole.min_gap_m for pole in self.poles)
 
 
-def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
+def rest_magnet(
+    heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float, plate: Float64 = NO_PLATE
+) -> Contact | None:
     """Set the magnet down on the map; None where nothing at all is known under it.
 
-    contact_gap_m: maximum gap between a face and steel on which it lies.
+    contact_gap_m: maximum gap between a face and steel on which it lies. plate: (N, 3) corners of a plate
+    under a face that the map doesn't show: along, across and height, m.
     """
     poles = magnet.pole_table
     shape, points = profiles(heights, place, poles)
@@ -118,7 +124,7 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
         return None
     noise = straighten_heights(points)
     most = np.tan(np.radians(magnet.limits.roll_deg))
-    u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
+    v, u, z = (np.append(points[seen, k], plate[:, n]) for n, k in enumerate((V, U, Z)))
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
     touch_gap = contact_gap_m + noise
     table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
@@ -144,6 +150,7 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
         noise,
         touch_gap,
         tuple(found),
+        plate[height + roll * plate[:, 1] + pitch * plate[:, 0] - plate[:, 2] <= touch_gap, :2],
     )
 
 

@@ -177,7 +177,7 @@ def _touched(contact: Contact, magnet: Magnet) -> Float64:
     """Return the corners (N, 2), along and across, in order, of the area between all places where the faces
     touch; none where they touch nothing.
     """
-    corners = list[tuple[float, float]]()
+    corners = [(float(v), float(u)) for v, u in contact.plate_m]
     for own, pole in zip(contact.poles, magnet.poles, strict=True):
         touches = own.gap_map_m <= contact.touch_gap_m
         if touches.any():
