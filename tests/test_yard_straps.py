@@ -454,6 +454,13 @@ def test_a_smeared_flank_ends_where_a_pack_is_widest() -> None:
     assert pack.sides_seen and pack.high_m == pytest.approx(0.1, abs=1.1 * CELL)
 
 
+def test_a_smeared_gully_ends_a_pack_where_it_is_widest() -> None:
+    """Bundles 125 mm wide were told as 190 to 200 mm where matching filled the gullies between them."""
+    gully = (0.08, -0.03), (0.1, -0.1), (0.13, -0.145), (0.16, -0.1), (0.18, -0.03), (0.4, 0.0)
+    pack = pack_beside(level_of(*LEFT, *gully), OTHER_ROWS, 0.19)
+    assert pack.sides_seen and pack.high_m == pytest.approx(0.115, abs=0.6 * CELL)
+
+
 @pytest.mark.parametrize(
     ("falls", "last"),
     [((0.3,), 0), ((0.0, 0.05, 0.3), 1), ((0.0, 0.05), 1), ((0.0, 0.12, 0.123, 0.126), 3)],

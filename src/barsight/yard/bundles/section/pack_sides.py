@@ -87,9 +87,10 @@ def find_side(
     """
     deep = flank_depth(top, width_m)
     limit = round(_FLANK_M / cell_m)
+    widest = top - max(_WIDEST_RATIO * width_m, _WIDEST_M)
     last, falls = _fall(outwards, limit if begin is None else min(begin, limit), deep)
     if falls:
-        last = _widest(outwards[: last + 1], top - max(_WIDEST_RATIO * width_m, _WIDEST_M), cell_m)
+        last = _widest(outwards[: last + 1], widest, cell_m)
         behind = outwards[last + 1 : last + 1 + _BEHIND_CELLS]
         known = behind[~np.isnan(behind)]
         open_below = (known[:_DEEP_CELLS] <= deep).sum() >= _DEEP_CELLS
@@ -106,8 +107,9 @@ def find_side(
     last = int(np.flatnonzero(np.isfinite(outwards[: bottom + 1]))[-1])
     hidden = not np.isfinite(outwards[last + 1 : bottom + _HIDDEN_CELLS]).all()
     fall = top - float(np.nanmin(outwards[: last + 1]))
+    end = _widest(outwards[: last + 1], widest, cell_m)
     if hidden and fall >= _STEEP_RATIO * width_m:
-        return last, PackSide.SEEN
+        return end, PackSide.SEEN
     before = np.concatenate([outwards[last:0:-1], inwards])
     rims = before[:_RIM_CELLS], outwards[last + 1 :][:_RIM_CELLS]
     if np.isfinite(rims[1][:1]).any() and min(map(_highest, rims)) - outwards[last] < _DENT_M:
@@ -117,7 +119,7 @@ def find_side(
     higher = rise > _HIGHER_M
     steep = fall >= (_COVERED_RATIO if higher else _STEEP_RATIO) * width_m
     if steep or not (higher or is_overhung(before, beside)):
-        return last, PackSide.SEEN
+        return end, PackSide.SEEN
     return last, PackSide.OPEN if rise > width_m else PackSide.COVERED
 
 
