@@ -385,6 +385,21 @@ def test_no_drawn_pack_has_a_gully_that_parts_two() -> None:
             assert _parting(outwards, len(outwards), level[crest], max(1.2 * diameter, 0.06)) is None
 
 
+def test_a_hexagon_on_its_corner_is_no_triangle() -> None:
+    """Four of 22 free bundles of `yard_dev` were no longer told as free."""
+    radius = 0.045
+    turn = np.pi / 3 * np.arange(6) + np.pi / 6
+    own = np.vstack([[0.0, 0.0], 2 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)])
+    width = 2 * radius * (1 + math.sqrt(3))
+    bars = np.vstack([own, own + np.array([width, 0.0])])
+    u = np.arange(-0.12, 0.4, CELL)
+    under = radius**2 - (u[:, None] - bars[:, 0]) ** 2
+    level = np.where(under > 0, bars[:, 1] + np.sqrt(np.maximum(under, 0.0)), -np.inf).max(axis=1)
+    at = int(np.searchsorted(u, 0.04))
+    last = int(np.argmin(level[at : at + 10]))
+    assert not ends_over_lower_bar(level[at:], level[at::-1], last, 3 * radius, width, CELL)
+
+
 @pytest.mark.parametrize(("leans_rad", "over"), [(-0.1, False), (0.7, True)], ids=["beside", "over"])
 def test_a_lower_bar_may_rest_on_the_flank_of_an_upright_triangle(leans_rad: float, *, over: bool) -> None:
     """Three bars of 90 mm, and one that touches the lower right one."""

@@ -53,11 +53,12 @@ that rises by more than the whole width is a separate stack.
 """
 MAX_FEW_RATIO = 2.4
 """Maximum width of a pack of three or four bars, in their maximum diameter."""
-_PEAK_FALL_RATIO, _PEAK_RATIO, _PEAKED_FALL_RATIO = 0.12, 0.5, 0.6
+_PEAK_FALL_RATIO, _PEAK_RATIO, _PEAKED_FALL_RATIO = 0.25, 0.65, 0.6
 """A section is peaked where the part that falls by less than the first is narrower than the second, in
-widths: 0.43 of an upright triangle of three bars, 0.65 of a round pack and of a hexagon of seven. A triangle
-is widest 0.68 widths under its top: a flank that falls by less than the third ends over its lower bar, on
-which a neighbour may rest, even a lower one.
+widths: 0.5 of an upright triangle of three bars, 0.87 of a round pack, and 0.92 of a hexagon of seven that
+stands on a corner, whose shoulders lie 0.18 widths under its top. A triangle is widest 0.68 widths under its
+top: a flank that falls by less than the third ends over its lower bar, on which a neighbour may rest, even a
+lower one.
 """
 _BEHIND_CELLS = 16
 """Number of places behind a flank within which a neighbour that stands over it must begin."""
@@ -127,7 +128,7 @@ def ends_over_lower_bar(
     outwards: Float64, inwards: Float64, last: int, top: float, width_m: float, cell_m: float
 ) -> bool:
     """Check whether a flank that ends at `last` may end over its own lower bar, as that of an upright
-    triangle of bars does where a neighbour rests on it. Arguments: of `find_side`.
+    triangle of bars does where a neighbour rests on it. width_m: of the pack; others: of `find_side`.
     """
     beyond = outwards[last:][:_BEHIND_CELLS]
     beyond = beyond[~np.isnan(beyond)]

@@ -135,7 +135,7 @@ def find_pack(
     cell = float(beside_m[1] - beside_m[0])
     level_inside = level_m[inside[0] : inside[-1] + 1]
     is_one = own.spread_m <= _SPREAD_M and dip_depth(level_inside) < _DIP_RATIO * own.width_m
-    ends, others, sides, hidden = [], [], [], []
+    ends, others, sides, hidden, flanks = [], [], [], [], []
     for step, at, beyond in ((-1, inside[0], spans[:number][::-1]), (1, inside[-1], spans[number + 1 :])):
         near, begin, shared = np.inf, None, None
         for other in beyond:
@@ -150,12 +150,14 @@ def find_pack(
         last, side = find_side(*around, begin, None if shared else shared, top, own.width_m, cell, thick_m)
         if shared and side is PackSide.SEEN:
             last, side = find_side(*around, begin, True, top, own.width_m, cell, thick_m)
-        few = not own.width_m > MAX_FEW_RATIO * thick_m
-        if few and side is PackSide.SEEN and ends_over_lower_bar(*around, last, top, own.width_m, cell):
-            side = PackSide.COVERED
+        flanks.append((*around, last))
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
         hidden.append(cell * hidden_places(around[0], last))
+    if not own.width_m > MAX_FEW_RATIO * thick_m:
+        for k, flank in enumerate(flanks):
+            if sides[k] is PackSide.SEEN and ends_over_lower_bar(*flank, top, ends[1] - ends[0], cell):
+                sides[k] = PackSide.COVERED
     return Pack(
         ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]), math.nan,
         (hidden[0], hidden[1]),
