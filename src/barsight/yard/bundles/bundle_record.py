@@ -38,7 +38,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
 from barsight.yard.sections import MapStretch, part_about
-from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, YardMap
+from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, HeightMap, YardMap
 
 _SLOPE_RATIO = 0.6
 """Factor on the slope's sigma, which follows from errors correlated over `correlated_along_m`: errors that
@@ -80,11 +80,12 @@ def describe_bundles(
 
 
 def make_bundle(
-    reading: Reading, others: list[FittedOutline], settings: BundleSettings, floor_m: float | None
-) -> Bundle:
+    reading: Reading, others: list[FittedOutline], settings: BundleSettings, floor_m: float | None,
+    heights: HeightMap,
+) -> Bundle:  # fmt: skip
     """Make a bundle of a chosen reading, without number, layer and what lies on it. others: all chosen."""
     grid, fit = reading.found.grid, reading.found.fit
-    ends = [find_end(grid, fit, step, settings) for step in (-1, 1)]
+    ends = [find_end(grid, fit, step, settings, heights) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)
     axis = np.array([_in_map(grid, fit, end.v_m) for end in ends])
     yaw = grid.heading_rad - np.arctan(fit.values[SLOPE_U])

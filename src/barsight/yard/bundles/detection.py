@@ -128,7 +128,7 @@ def _search(
         for one in _settled(found, _weights(found, floor), claims, height_map, settings)
     ]
     chosen_ones = [reading.found for reading in readings]
-    bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
+    bundles = [make_bundle(reading, chosen_ones, settings, floor, height_map) for reading in readings]
     joined = join_pieces(without_pieces(bundles, readings))
     return list(ordered_map(lambda bundle: with_thin_lines(bundle, height_map), joined))
 
