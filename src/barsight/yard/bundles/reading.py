@@ -8,6 +8,7 @@ from barsight.yard.bundles.fitting.outline_fit import FittedOutline
 from barsight.yard.bundles.section.flanks import Flanks, seen_flanks
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack
+from barsight.yard.bundles.section.seen_section import SeenSection
 
 _SAME_RATIO, _SAME_M = 0.12, 0.005
 """Tolerance between an outline's edges and those of the pack that it describes: a fraction of the width, plus
@@ -43,7 +44,27 @@ class Reading:
         if pack is None or not pack.is_bounded:
             return True
         off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
-        return off < _SAME_RATIO * width + _SAME_M
+        return off < self.same_m
+
+    @property
+    def same_m(self) -> float:
+        """Return the maximum distance (m) between edges, or difference of widths, that count as the same."""
+        return _SAME_RATIO * self.found.fit.width_m + _SAME_M
+
+    def holds_straps(self, seen: SeenSection | None) -> bool:
+        """Check whether straps that show on a part of the outline lie within it and end at one of its edges,
+        and something else shows that it is the bundle's: its packing in the photo, or both its sides.
+        """
+        pack, half, same_m = self.pack, self.found.fit.width_m / 2, self.same_m
+        if pack is None:
+            return False
+        beyond = -half - pack.low_m, pack.high_m - half
+        ends = zip(pack.sides, beyond, strict=True)
+        if max(beyond) > same_m or not any(s == PackSide.SEEN and abs(off) < same_m for s, off in ends):
+            return False
+        if self.found.shades is not None:
+            return True
+        return seen is not None and seen.sides_seen and abs(seen.width_m - 2 * half) < same_m
 
     @property
     def ends_inside(self) -> bool:

@@ -62,7 +62,7 @@ def held_by_straps(
     pack = reading.pack
     if pack is None:
         return _without_straps(bundle, irregular, reading)
-    held = _held(bundle, irregular, reading, pack, floor_m)
+    held = _held(bundle, irregular, reading, seen, floor_m)
     if held.bars is not None or not _may_go_on(pack, seen):
         return held
     said = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
@@ -120,11 +120,14 @@ def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
 
 
 def _held(
-    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, seen: SeenSection | None, floor_m: float | None
 ) -> Bundle:
     """Correct a bundle by its straps as if they showed all across it; see `held_by_straps`."""
+    pack = reading.pack
+    assert pack is not None
     if not pack.is_bounded:
-        return _partly_seen(bundle, irregular, pack)
+        aside_m = 0.0 if reading.holds_straps(seen) else abs(pack.middle_m)
+        return _partly_seen(bundle, irregular, pack, aside_m)
     if reading.outlines_pack:
         if bundle.bars is not None and pack.sides_seen:
             return bundle
@@ -201,8 +204,10 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
     )
 
 
-def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
-    """Mark as doubtful a bundle whose pack extends beyond it or lies aside, with a flank that isn't seen."""
+def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack, aside_m: float) -> Bundle:
+    """Mark as doubtful a bundle whose pack extends beyond it or lies aside, by aside_m, with a flank that
+    isn't seen.
+    """
     beyond_m, said = contradicts(pack, bundle.width_m)
     if said:
         sure, reasons = min(bundle.confidence, DOUBTFUL), (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
@@ -214,8 +219,8 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
         )
     if bundle.bars is None:
         bundle = replace(bundle, sigma=irregular)
-    if abs(pack.middle_m) > _ASIDE_M:
-        lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
+    if aside_m > _ASIDE_M:
+        lateral = float(np.hypot(bundle.sigma.lateral_m, aside_m))
         bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
     if bundle.bars is None and pack.diameter_m > 0:
         spread = _LINES_SIGMA_RATIO * pack.diameter_m
