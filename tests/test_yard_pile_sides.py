@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barsight.core.records.heights import HeightSource
 from barsight.yard.stability.pile_sides import pile_sides
 from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle
@@ -48,6 +49,17 @@ def test_a_bundle_over_the_edge_stands_over_and_leans() -> None:
     assert high.bundles == (1,) and low.bundles == (0, 1)
     assert high.overhangs[0].overhang_m == pytest.approx(0.1, abs=0.02) and high.lean_deg > 5
     assert low.overhangs[1].overhang_m == pytest.approx(-0.1, abs=0.001) and low.lean_deg < -5
+
+
+def test_a_bundle_beside_its_neighbour_isnt_told_to_stand_over_the_gully_between() -> None:
+    """Bundles within a layer "overhung" and "leaned" beside a gully that the map missed."""
+    stock = [laid(0.0), laid(0.3), laid(0.6), laid(0.04, z=0.56), laid(0.34, z=0.56)]
+    bundles = tuple(record(one, k, layer=int(one.z_m > 0.5)) for k, one in enumerate(stock))
+    heights = map_of(stock)
+    gully = (heights.x_m > 0.165) & (heights.x_m < 0.215)
+    heights.z_m[:, gully], heights.source[:, gully] = np.nan, HeightSource.UNKNOWN
+    *_, left, right = footings(heights, bundles, SETTINGS)
+    assert left.overhang_side == right.overhang_side == 0 and left.lean_deg == 0
 
 
 def test_the_stated_sigmas_hold() -> None:

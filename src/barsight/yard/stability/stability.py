@@ -32,6 +32,8 @@ MIN_KNOWN, MIN_PLACES = 0.3, 10
 """Minimum share of a place's stations that must have been seen, and minimum number of such places."""
 FREE_RATIO = 1.2
 """Minimum drop beside a bundle, in its widths, that reaches below its support."""
+SHOULDER_M = 0.06
+"""Maximum distance (m) from a bundle's edge at which its own shoulder shows."""
 LEVEL_M = 0.05
 """Height (m) over the lowest place beside a bundle, or over the floor, that counts as level with it."""
 SHEER_M = 0.15
@@ -93,14 +95,18 @@ def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSett
 
 
 def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Footing:
-    low, high = (_side(_profile(heights, bundle, sign), bundle) for sign in (-1, 1))
+    profiles = [_profile(heights, bundle, sign) for sign in (-1, 1)]
+    low, high = (_side(profile, bundle) for profile in profiles)
+    low_falls, high_falls = (
+        side.drop_m > FREE_RATIO * bundle.width_m and not _is_flanked(profile, bundle)
+        for side, profile in zip((low, high), profiles, strict=True)
+    )
     overhang, side, lean = math.nan, 0, 0.0
     if bundle.layer > 0:
         for sign, outer, inner in ((-1, low, high), (1, high, low)):
-            stands_over = outer.ledge_m < MIN_LEDGE_M and _is_free(outer, bundle)
             # A map blurs both edges alike: what shows equally on both sides doesn't reveal a shift.
             shift = inner.ledge_m - outer.ledge_m
-            if not (stands_over and _is_free(inner, bundle)):
+            if not (low_falls and high_falls and outer.ledge_m < MIN_LEDGE_M):
                 continue
             if shift < MIN_LEDGE_M - STEP_M / 2:
                 overhang = 0.0 if math.isnan(overhang) else overhang
@@ -115,9 +121,19 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
     return Footing(bundle.id, (low, high), overhang, side, lean, min(tops, default=math.nan))
 
 
-def _is_free(side: Side, bundle: Bundle) -> bool:
-    """Check whether the surface beside the bundle falls below the bundle's support."""
-    return side.drop_m > FREE_RATIO * bundle.width_m
+def _is_flanked(profile: Float64, bundle: Bundle) -> bool:
+    """Check whether something higher than the bundle's underside stands beside it before a place below its
+    support is seen, as a bundle of its own layer does: what carries both goes on there, or isn't known.
+    """
+    z = np.where(profile[:, 1] >= MIN_KNOWN, profile[:, 0], np.nan)
+    falls = np.flatnonzero(z <= _below_support(bundle))
+    beside = z[round(SHOULDER_M / STEP_M) : falls[0] if falls.size else None]
+    return bool((beside > bundle.top_z_m - bundle.width_m).any())
+
+
+def _below_support(bundle: Bundle) -> float:
+    """Return the height (m) below which a surface is none of the layer that carries the bundle."""
+    return max(bundle.top_z_m - 1.5 * bundle.width_m - DUNNAGE_M / 2, LEVEL_M)
 
 
 def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
@@ -146,9 +162,7 @@ def _side(profile: Float64, bundle: Bundle) -> Side:
     drop = bundle.top_z_m - lowest
     run = float(np.flatnonzero(np.nan_to_num(z, nan=np.inf) <= lowest + LEVEL_M)[0]) * STEP_M
     slope = math.degrees(math.atan2(drop, run))
-    base = bundle.top_z_m - bundle.width_m
-    floor_of_layer = base - DUNNAGE_M / 2 - 0.5 * bundle.width_m
-    shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > max(floor_of_layer, LEVEL_M)))
+    shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > _below_support(bundle)))
     ledge = float(shows[0] if shows.size else len(z)) * STEP_M
     near = z[: round(SHEER_M / STEP_M) + 1]
     sheer = bundle.top_z_m - float(np.nanmin(near)) if np.isfinite(near).any() else math.nan
