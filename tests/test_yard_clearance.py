@@ -9,7 +9,8 @@ import pytest
 
 import yard_maps
 from barsight.core.records.heights import HeightSource
-from barsight.yard.lifting.clearance import BEAM_CLEAR_M, leaning_checks
+from barsight.yard.lifting.clearance import BEAM_CLEAR_M
+from barsight.yard.lifting.load import leaning_checks
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
@@ -185,26 +186,40 @@ def test_no_stanchion_that_the_map_does_not_show_stands_in_the_magnet(
     assert codes(lift) == (set() if passes else {"obstructed"}), lift.vetoes
 
 
-@pytest.mark.parametrize(("roll_deg", "down_m", "sigma_m", "passes"), [
-    (0.0, 0.012, 0.001, True), (0.0, 0.016, 0.001, False), (-6.0, 0.001, 0.004, True),
-    (6.0, 0.007, 0.001, False), (-6.0, 0.007, 0.001, False), (6.0, 0.001, 0.0072, False),
-    (0.0, 0.006, 0.0075, True), (0.0, 0.007, 0.0075, False),
+@pytest.mark.parametrize(("roll_deg", "down_m", "sigma_m", "aside_m", "passes"), [
+    (0.0, 0.013, 0.001, 0.0, True), (0.0, 0.016, 0.001, 0.0, False), (-6.0, 0.001, 0.004, 0.0, True),
+    (6.0, 0.007, 0.001, 0.0, False), (-6.0, 0.007, 0.001, 0.0, False), (6.0, 0.001, 0.0045, 0.0, False),
+    (0.0, 0.003, 0.0072, 0.0, True), (0.0, 0.004, 0.0072, 0.0, False), (6.0, 0.007, 0.001, 0.06, False),
+    (6.0, 0.007, 0.001, -0.06, True), (-6.0, 0.007, 0.001, 0.06, True), (-6.0, 0.007, 0.001, -0.06, False),
 ])  # fmt: skip
 def test_the_loads_top_does_not_stand_above_leaning_faces(
-    roll_deg: float, down_m: float, sigma_m: float, *, passes: bool
+    roll_deg: float, down_m: float, sigma_m: float, aside_m: float, *, passes: bool
 ) -> None:
-    """A map cuts crests off: the faces may lie lower than the fitted top, and lean down from there. A map of
-    polished bars was 9 mm too low with a sigma of 7.2 mm: tops stood 15 to 19 mm above the stated plane.
+    """The faces may lie lower than the fitted top, and lean down from there. A map of polished bars was 9 mm
+    too low with a sigma of 7.2 mm: tops stood 15 to 19 mm above the stated plane. Where the faces lean down
+    beside the load, towards -X for a positive slope, no crest lies beyond the outermost bar's axis.
     """
-    bundle, place = record(laid(0.3)), Placement(0.3, 0.0, 0.0)
-    heights = np.full(len(MAGNET.poles), bundle.top_z_m - down_m)
-    lean_rad, sigmas_m = np.radians(roll_deg), (sigma_m, 0.0005)
-    contact = Contact(bundle.top_z_m - down_m, heights, 0.0, lean_rad, 0.0, *sigmas_m, 0.0035, ())
+    bundle, place = record(laid(0.3)), Placement(0.3 + aside_m, 0.0, 0.0)
+    z_m = bundle.top_z_m + SETTINGS.strap_m - down_m
+    heights, lean_rad = np.full(len(MAGNET.poles), z_m), np.radians(roll_deg)
+    contact = Contact(z_m, heights, 0.0, lean_rad, 0.0, sigma_m, 0.0005, 0.0035, ())
     narrow = replace(MAGNET, tolerance=Tolerance(0.02, 0.02, 0.2))
-    (check,) = leaning_checks(place, narrow, contact, (bundle,))
-    half_m = MAGNET.pole_table[0, 3] / 2 + 0.02
-    assert check.value == pytest.approx(1e3 * (down_m + half_m * np.tan(np.radians(abs(roll_deg)))), abs=0.01)
+    (check,) = leaning_checks(place, narrow, contact, (bundle,), SETTINGS.strap_m)
+    outermost_m = 0.09 * 1.003 + 1.645 * (0.001 / 2 + np.hypot(SIGMA.lateral_m, SIGMA.width_m / 2))
+    half_m = min(MAGNET.pole_table[0, 3] / 2 + 0.02, outermost_m + np.sign(roll_deg) * aside_m)
+    assert check.value == pytest.approx(1e3 * (down_m + half_m * np.tan(abs(lean_rad))), abs=0.01)
     assert (not vetoes_of([check])) is passes
+
+
+@pytest.mark.parametrize("askew_deg", [5.0, 90.0])
+def test_bars_that_lie_askew_may_have_a_crest_at_the_faces_edge(askew_deg: float) -> None:
+    bundle, place = record(laid(0.3)), Placement(0.24, 0.0, np.radians(askew_deg))
+    z_m = bundle.top_z_m + SETTINGS.strap_m
+    contact = Contact(z_m, np.full(len(MAGNET.poles), z_m), 0.0, 0.1, 0.0, 0.001, 0.0005, 0.0035, ())
+    narrow = replace(MAGNET, tolerance=Tolerance(0.02, 0.02, 0.2))
+    (check,) = leaning_checks(place, narrow, contact, (bundle,), SETTINGS.strap_m)
+    edge_m = MAGNET.pole_table[0, 3] / 2 + narrow.tolerance.along(place.across)
+    assert check.value == pytest.approx(1e3 * edge_m * np.tan(0.1), abs=0.01)
 
 
 @pytest.mark.parametrize("cell_m", [0.01, 0.008, 0.005])

@@ -27,6 +27,7 @@ from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts, read_unseen
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.holding import over_map_m
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
@@ -166,9 +167,11 @@ def draw_place(
     part = part_about(heights, place.x_m + reach, place.y_m + reach)
     # The first check of obstacles states the sigma that they are judged with.
     sigma_mm = next(check["sigma"] for check in record["checks"] if check["code"] == "obstructed")
+    load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
     faces = FacePlane(
-        target["z_m"], math.radians(record["pitch_deg"]), math.radians(record["roll_deg"]), sigma_mm / 1e3
-    )
+        target["z_m"] - over_map_m(load, settings.strap_m), math.radians(record["pitch_deg"]),
+        math.radians(record["roll_deg"]), sigma_mm / 1e3,
+    )  # fmt: skip
     picture = _paint(part, place, faces, long, wide)
 
     def pixels(xy_m: Float64) -> Float64:
@@ -176,7 +179,6 @@ def draw_place(
         along, across = away @ place.along, away @ place.across
         return np.stack([(along + long) * PIXELS_PER_M, (across + wide) * PIXELS_PER_M], axis=-1)
 
-    load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
     obstacle = find_obstacle(place, part, magnet, faces, load)
     if obstacle is not None:
         half = math.ceil(0.005 * PIXELS_PER_M)

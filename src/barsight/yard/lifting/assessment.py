@@ -21,11 +21,10 @@ from barsight.yard.lifting.clearance import (
     FacePlane,
     clearance_checks,
     find_obstacle,
-    leaning_checks,
-    resting_checks,
 )
 from barsight.yard.lifting.labels import SeenLabel, find_labels, rests_on_label
 from barsight.yard.lifting.lift import Lift, LiftScene
+from barsight.yard.lifting.load import leaning_checks, resting_checks
 from barsight.yard.lifting.thin_bars import (
     beside_checks,
     edge_checks,
@@ -100,7 +99,7 @@ class Hold:
         return [
             *face_checks(self.contact, needed_n, magnet, load, settings),
             *share_checks(self.weakest, self.pried, self.worst),
-            *resting_checks(place, magnet, self.contact, load),
+            *resting_checks(place, magnet, self.contact, load, settings.strap_m),
         ]
 
 
@@ -130,7 +129,7 @@ def assess_placement(
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *hold.checks(place, magnet, load, needed, settings),
         *clearance_checks(place, yard.heights, magnet, contact, load, settings.stanchions),
-        *leaning_checks(place, magnet, contact, load),
+        *leaning_checks(place, magnet, contact, load, settings.strap_m),
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
@@ -140,8 +139,8 @@ def assess_placement(
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
         if has_pictures(yard.heights, pixel_m):
-            faces_z_m = contact.centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
-            others = [b for b in near.bundles if b not in load and may_reach(b, place, magnet, faces_z_m)]
+            low_z_m = FacePlane.of(contact).centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
+            others = [b for b in near.bundles if b not in load and may_reach(b, place, magnet, low_z_m)]
             checks += edge_checks(others)
             checks += beside_checks(place, magnet, tuple((b, yard.thin_lines(b)) for b in others))
     scale = 0.0
@@ -178,7 +177,7 @@ def _on_label(
         failed = vetoes_of([
             *one.checks(place, magnet, load, needed_n, settings),
             *clearance_checks(place, yard.heights, magnet, one.contact, load, settings.stanchions),
-            *leaning_checks(place, magnet, one.contact, load),
+            *leaning_checks(place, magnet, one.contact, load, settings.strap_m),
         ])  # fmt: skip
         if failed:
             reason = failed[0].reason
@@ -198,10 +197,10 @@ def _grip(
     contact: Contact,
 ) -> Grip:  # fmt: skip
     """Count the bundles that the poles take, bounded by how far each one reaches on the map."""
-    reached = reached_strips(heights, place, magnet, tolerance, contact.z_m)
-    held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
-    clear = seen_clearances(held, heights, place, near, contact.z_m - magnet.reach_m, reached)
-    held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached, clear)
+    reached = reached_strips(heights, place, magnet, tolerance, contact.map_z_m)
+    held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached)
+    clear = seen_clearances(held, heights, place, near, contact.map_z_m - magnet.reach_m, reached)
+    held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached, clear)
     return without_parted(held, heights, place, near, reached)
 
 

@@ -313,7 +313,8 @@ def _unexplained(
     return _stray_shares(
         heights.z_m, heights.source, np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
         place.frame,
-        _face_grid(magnet, math.ceil(1e3 * (float(across) + margin))), contact.z_m - magnet.reach_m, outlines,
+        _face_grid(magnet, math.ceil(1e3 * (float(across) + margin))), contact.map_z_m - magnet.reach_m,
+        outlines,
     )  # fmt: skip
 
 

@@ -14,8 +14,6 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
-from barsight.yard.lift_settings import UPPER
-from barsight.yard.lifting.load import tops_at
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
@@ -23,16 +21,13 @@ from barsight.yard.magnet.stanchions import stanchion_checks
 from barsight.yard.map_lookup import cell_spans, highest_seen
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.unseen import wide_parts
-from barsight.yard.vetoes import Check, check_max
+from barsight.yard.vetoes import Check
 
 STEP_M = 0.01
 STRAY_FIELD_M = 0.03
 """Distance (m) from a face or the beam within which the stray field attracts steel."""
 MAX_RISE_M = 0.012
 """Maximum rise (m) over the faces' plane of a patch that is no obstacle, by medians over squares of 50 mm."""
-MAX_TOP_RISE_M = 0.014
-"""Maximum height (m) of the load's own fitted top above the plane where the plane is lowest: a map cuts off
-crests of thick bars by some 6 mm."""
 MAX_NARROW_RISE_M = 0.020
 """The same of a patch that is too narrow for those, by medians over squares of 30 mm."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
@@ -56,7 +51,9 @@ _NO_BOUNDS = np.empty((0, 0), np.float32)
 
 @dataclass(frozen=True)
 class FacePlane:
-    """Plane of the faces at rest: height at the magnet's centre, slopes along and across, height sigma."""
+    """Plane of the faces at rest on the map: height at the magnet's centre, slopes along and across, height
+    sigma. It is compared with heights of that map, which cuts off what stands on a load as it cuts crests.
+    """
 
     centre_z_m: float
     pitch_rad: float
@@ -66,7 +63,8 @@ class FacePlane:
     @classmethod
     def of(cls, contact: Contact) -> FacePlane:
         """Take the plane from a contact."""
-        return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
+        height = contact.centre_z_m - contact.over_map_m
+        return cls(height, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
 
     @property
     def table(self) -> Float64:
@@ -202,53 +200,6 @@ def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bo
         beside, beyond = (np.abs(axis[0] * dx + axis[1] * dy) for axis in bundle.axes)
         over |= (beside <= bundle.width_m / 2 + margin_m) & (beyond <= bundle.length_m / 2 + margin_m)
     return over
-
-
-def resting_checks(
-    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
-) -> list[Check]:
-    """Check that nothing lies between the faces and the load: no face may rest above the load's top."""
-    if not load:
-        return []
-    above = contact.z_m - _tops(place, magnet, load)
-    sigmas = np.array([float(np.nan_to_num(bundle.sigma.top_z_m)) for bundle in load])
-    highest = 1e3 * float((above - UPPER * sigmas[:, None]).min(axis=0).max())
-    sigma = 1e3 * float(sigmas.max())
-    return [
-        check_max(
-            "obstructed", "lower bound of the height of a face above the load's top", highest - sigma,
-            1e3 * MAX_RISE_M, "mm", f"a face would rest at least {highest:.0f} mm above the load's "
-            f"top, so something lies between them; the limit is {1e3 * MAX_RISE_M:.0f} mm", sigma=sigma,
-        )
-    ]  # fmt: skip
-
-
-def leaning_checks(
-    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
-) -> list[Check]:
-    """Check that the load's top stays below the faces where they lean lowest within the crane's tolerance.
-
-    The faces are sent to a stated height, so its error counts as well as that of the gap.
-    """
-    if not load:
-        return []
-    slack = float(magnet.tolerance.along(place.across))
-    down = (magnet.pole_table[:, 3] / 2 + slack) * math.tan(abs(contact.roll_rad))
-    rise, sigma = 1e3 * float((_tops(place, magnet, load) - contact.z_m + down).max()), 1e3 * contact.sigma_m
-    return [
-        check_max(
-            "obstructed", "height of the load's top above the lowest edge of the tilted faces", rise,
-            1e3 * MAX_TOP_RISE_M, "mm", f"the load's top is {rise:.0f} mm (1 sigma "
-            f"{sigma:.0f} mm) above the lowest edge of the tilted faces, within the crane's tolerance; the "
-            f"limit is {1e3 * MAX_TOP_RISE_M:.0f} mm",
-            sigma=sigma,
-        )
-    ]  # fmt: skip
-
-
-def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
-    """Compute the heights (bundles, poles) of the load's tops at the poles."""
-    return tops_at(load, magnet.pole_table[:, :2] @ place.beam_axes + (place.x_m, place.y_m))
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:

@@ -1,4 +1,6 @@
-"""Describe the load on the magnet as a box: outline and height of one bundle or several."""
+"""Describe the load on the magnet: as a box, outline and height of one bundle or several, and by its top,
+which must lie at the faces.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,21 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.axes import axes_of
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.magnet.description import Tolerance
+from barsight.yard.magnet.contact import Contact
+from barsight.yard.magnet.description import Magnet, Tolerance
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.stability.stability import mean_yaw
 from barsight.yard.types import Bundle, known_sigma
+from barsight.yard.vetoes import Check, check_max
 from barsight.yard.weight import load_centre
+
+MAX_ABOVE_TOP_M = 0.012
+"""Maximum height (m), as a lower bound, of a face above the load's top."""
+MAX_TOP_RISE_M = 0.015
+"""Maximum height (m), as a 95 % bound, of the load's own fitted top above the stated plane where that is
+lowest over it.
+"""
 
 
 @dataclass(frozen=True)
@@ -119,3 +131,69 @@ def tops_at(bundles: tuple[Bundle, ...], places_m: Float64) -> Float64:
         bundle.top_z_m + away * math.tan(bundle.pitch_rad)
         for bundle, away in zip(bundles, along, strict=True)
     ])  # fmt: skip
+
+
+def resting_checks(
+    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...], strap_m: float
+) -> list[Check]:
+    """Check that nothing lies between the faces and the load: no face may rest above the load's top."""
+    if not load:
+        return []
+    above = contact.z_m - _tops(place, magnet, load, strap_m)
+    sigmas = np.array([float(np.nan_to_num(bundle.sigma.top_z_m)) for bundle in load])
+    highest = 1e3 * float((above - UPPER * sigmas[:, None]).min(axis=0).max())
+    sigma = 1e3 * float(sigmas.max())
+    return [
+        check_max(
+            "obstructed", "lower bound of the height of a face above the load's top", highest - sigma,
+            1e3 * MAX_ABOVE_TOP_M, "mm", f"a face would rest at least {highest:.0f} mm above the load's "
+            f"top, so something lies between them; the limit is {1e3 * MAX_ABOVE_TOP_M:.0f} mm", sigma=sigma,
+        )
+    ]  # fmt: skip
+
+
+def leaning_checks(
+    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...], strap_m: float
+) -> list[Check]:
+    """Check that the load's top stays below the faces where they lean lowest within the crane's tolerance.
+
+    The faces are sent to a stated height, so its error counts as well as that of the gap.
+    """
+    if not load:
+        return []
+    down = _lowest_m(place, magnet, load, contact.roll_rad) * math.tan(abs(contact.roll_rad))
+    tops = _tops(place, magnet, load, strap_m)
+    rise, sigma = 1e3 * float((tops - contact.z_m + down).max()), 1e3 * contact.sigma_m
+    return [
+        check_max(
+            "obstructed", "height of the load's top above the lowest place of the tilted faces over it", rise,
+            1e3 * MAX_TOP_RISE_M, "mm", f"the load's top is {rise:.0f} mm (with its error "
+            f"{rise + UPPER * sigma:.0f} mm) above the tilted faces where they are lowest over it, within "
+            f"the crane's tolerance; the limit is {1e3 * MAX_TOP_RISE_M:.0f} mm",
+            sigma=sigma, sigmas=UPPER,
+        )
+    ]  # fmt: skip
+
+
+def _lowest_m(place: Placement, magnet: Magnet, load: tuple[Bundle, ...], roll_rad: float) -> Float64:
+    """Compute the distances (bundles, poles) from the poles' middles to the lowest place of the faces that
+    may lie over a crest: within the crane's tolerance, and no further out than the axis of the outermost bar.
+    """
+    poles, (far, edge) = magnet.pole_table, magnet.tolerance.along(place.beam_axes)
+    at = poles[:, :2] @ place.beam_axes + (place.x_m, place.y_m)
+    out = []
+    for bundle in load:
+        across, sigma = bundle.axes[0], bundle.sigma
+        turned, level = float(across @ place.along), float(across @ place.across)
+        middle = -(at - bundle.centre_m[:2]) @ across * np.sign(level)
+        reach = (bundle.width_m - min_diameter_m(bundle)) / 2
+        reach += UPPER * math.hypot(known_sigma(sigma.lateral_m), known_sigma(sigma.width_m) / 2)
+        # Bars askew under the beam cross a face: the outermost one is furthest out at the end of the face.
+        crest = reach - math.copysign(1.0, roll_rad) * middle + abs(turned) * (poles[:, 2] / 2 + far)
+        out.append(np.clip(crest / max(abs(level), 1e-6), 0.0, poles[:, 3] / 2 + edge))
+    return np.array(out)
+
+
+def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Float64:
+    """Compute the heights (bundles, poles) of the load's tops at the poles, with a strap on them."""
+    return tops_at(load, magnet.pole_table[:, :2] @ place.beam_axes + (place.x_m, place.y_m)) + strap_m

@@ -67,9 +67,11 @@ class Contact:
     pitch_rad: slope along the beam; roll_rad: slope across. rests_off_m: how far from the middle the faces
     rest where the suspension stops their lean, otherwise 0. sigma_m: of the plane's height, including the
     error that the whole map shares; gap_sigma_m: of the height over the steel. touch_gap_m: maximum gap at
-    which a place of a face touches. pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m:
-    the largest of the poles' smallest gaps. contact_share: of all faces; unknown_share: the worst pole's.
-    plate_m: (N, 2) places, along and across, where the faces touch a plate on the steel (`rest_magnet`).
+    which a place of a face touches. over_map_m: how much higher than on the map the faces lie on a known
+    load; map_z_m: (P,) their height on the map. pull_n, pull_low_n: the pull, and its lower bound (95 %).
+    widest_gap_m: the largest of the poles' smallest gaps. contact_share: of all faces; unknown_share: the
+    worst pole's. plate_m: (N, 2) places, along and across, where the faces touch a plate on the steel
+    (`rest_magnet`).
     """
 
     centre_z_m: float
@@ -82,6 +84,12 @@ class Contact:
     touch_gap_m: float
     poles: tuple[PoleContact, ...]
     plate_m: Float64 = field(default_factory=lambda: np.empty((0, 2)))
+    over_map_m: float = 0.0
+
+    @property
+    def map_z_m(self) -> Float64:
+        """Return the heights (P,) at the poles as if the faces lay on the map itself."""
+        return self.z_m - self.over_map_m
 
     @property
     def pull_n(self) -> float:
@@ -128,7 +136,9 @@ def rest_magnet(
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
     touch_gap = contact_gap_m + noise
     table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
-    shared = float(np.median(points[seen, SIGMA]))
+    sigma, gap = points[seen, SIGMA], (height + roll * u + pitch * v - z)[: seen.sum()]
+    # Faces that rest on a plate alone may touch none of the map.
+    touched = sigma[gap <= touch_gap] if (gap <= touch_gap).any() else sigma
     faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
     found, first = [], 0
     for number, (columns, parts) in enumerate(shape):
@@ -146,7 +156,7 @@ def rest_magnet(
         math.atan(pitch),
         math.atan(roll),
         rests_off,
-        math.hypot(noise, shared),
+        math.hypot(noise, float(np.median(touched))),
         noise,
         touch_gap,
         tuple(found),

@@ -35,14 +35,30 @@ MIN_DIAMETER_RATIO = 0.1
 
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
-    """Add the pull on the load's bars; without a load there is none.
+    """Lay the faces on the load where it is likely to be, over_map_m higher than the map shows, and add the
+    pull on its bars. Without a load the contact stays as it is.
 
-    strap_m: thickness of a strap that may hold the faces off.
+    strap_m: thickness of a strap, which may hold the faces off.
     """
     if not load:
         return contact
-    diameter = min(min_diameter_m(bundle) for bundle in load)
-    cut = min(SMOOTHING_M**2 / diameter, MAX_CUT_RATIO * diameter)
+    higher, held = over_map_m(load, strap_m), _pulled(contact, magnet, load, strap_m)
+    return replace(
+        held, centre_z_m=held.centre_z_m + higher, z_m=held.z_m + higher, over_map_m=higher,
+        poles=tuple(replace(own, z_m=own.z_m + higher) for own in held.poles),
+    )  # fmt: skip
+
+
+def over_map_m(load: tuple[Bundle, ...], strap_m: float) -> float:
+    """Estimate how much higher (m) than a map shows faces lie on a load: by half of what may be cut off its
+    crests, and by a strap.
+    """
+    return _max_cut_m(load)[1] / 2 + strap_m if load else 0.0
+
+
+def _pulled(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
+    """Add the pull on the bars of a load of at least one bundle."""
+    diameter, cut = _max_cut_m(load)
     higher = cut + strap_m + UPPER * contact.gap_sigma_m
     return replace(
         contact,
@@ -51,6 +67,12 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
             for own, pole in zip(contact.poles, magnet.poles, strict=True)
         ),
     )
+
+
+def _max_cut_m(load: tuple[Bundle, ...]) -> tuple[float, float]:
+    """Compute the minimum diameter (m) of a load's bars, and how much (m) may be cut off their crests."""
+    diameter = min(min_diameter_m(bundle) for bundle in load)
+    return diameter, min(SMOOTHING_M**2 / diameter, MAX_CUT_RATIO * diameter)
 
 
 def _pull(
@@ -237,7 +259,7 @@ def weakest_bundle(
             replace(own, gap_map_m=np.where(_over(bundle, pole, place, own), own.gap_map_m, np.nan))
             for own, pole in zip(contact.poles, magnet.poles, strict=True)
         )
-        held = hold_load(replace(contact, poles=poles), magnet, (bundle,), strap_m)
+        held = _pulled(replace(contact, poles=poles), magnet, (bundle,), strap_m)
         needed_n = bundle_mass(bundle).upper_kg * NEWTON_PER_KG * magnet.needed_factor
         if not needed_n > 0:
             return math.nan
