@@ -20,9 +20,9 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.result_folder import read_heights
 from barsight.simulation.worlds.solids import Solid
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.lifting.labels import mark_labels
 from barsight.yard.magnet.description import example_magnet
 from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.placement.labels import mark_labels
 from barsight.yard.types import Bundle, HeightMap
 
 STEP_M, ASIDE_M, DEEP_M, POLE_M = 0.01, 0.12, 0.04, 0.09

@@ -21,9 +21,9 @@ from barsight.benchmarks.yard.drawn_worlds import CELL_M, exact_heights, judged_
 from barsight.core.records.heights import HeightSource
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.magnet.description import Beam, Pole, Tolerance, example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.clearance import FacePlane, find_obstacle
 from barsight.yard.types import Bundle, HeightMap
 
 FACE = (Pole(0, 0, 0.1, 0.1),), Beam(0.1, 0.1, 0.35), Tolerance(0.005, 0.005, 0.0)

@@ -32,13 +32,13 @@ from barsight.simulation.worlds.packing import tag
 from barsight.simulation.worlds.solids import SolidYard, cylinder
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.checks import face_checks
-from barsight.yard.lifting.clearance import FacePlane
-from barsight.yard.lifting.labels import find_labels, rests_on_label
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import hold_load
+from barsight.yard.placement.checks import face_checks
+from barsight.yard.placement.clearance import FacePlane
+from barsight.yard.placement.labels import find_labels, rests_on_label
 from lift_yards import laid, record
 
 

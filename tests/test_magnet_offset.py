@@ -26,10 +26,10 @@ from barsight.store.lift_records import find_gap, find_outlines
 from barsight.store.opening import Store
 from barsight.yard.axes import corners
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
-from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.targets import offset_vetoes, plan_lifts, put_down
 from barsight.yard.magnet.description import MagnetOffset, example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.load import Load
 from lift_yards import GIVEN, MAGNET, SETTINGS, laid, map_of, record, sure_travel
 from test_acceptance import CLEAN, observed, off_by, planned
 from yard_folders import schema

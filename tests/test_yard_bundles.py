@@ -38,8 +38,8 @@ from barsight.yard.bundles.section.seen_section import (
 )
 from barsight.yard.bundles.strapped_bundles import doubted_if_narrow, doubted_without_straps
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
+from barsight.yard.placement.load import Load
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 from barsight.yard.weight import bundle_mass
 from yard_maps import Laid, draw, photographed

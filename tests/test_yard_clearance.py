@@ -9,11 +9,11 @@ import pytest
 
 import yard_maps
 from barsight.core.records.heights import HeightSource
-from barsight.yard.lifting.clearance import BEAM_CLEAR_M
-from barsight.yard.lifting.load import leaning_checks
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.clearance import BEAM_CLEAR_M
+from barsight.yard.placement.load import leaning_checks
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import vetoes_of
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record

@@ -10,11 +10,11 @@ import pytest
 from scipy import ndimage
 
 from barsight.yard.lifting import labels
-from barsight.yard.lifting.clearance import FacePlane
-from barsight.yard.lifting.labels import find_labels, rests_on_label
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.clearance import FacePlane
+from barsight.yard.placement.labels import find_labels, rests_on_label
 from barsight.yard.plates import plate_masks
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record

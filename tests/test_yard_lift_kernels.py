@@ -10,8 +10,11 @@ import pytest
 from scipy import ndimage
 
 from barsight.core.records.heights import HeightSource
-from barsight.yard.lifting.checks import _stray_shares
-from barsight.yard.lifting.clearance import (
+from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.holding import _sum_pull
+from barsight.yard.map_lookup import interpolate_height
+from barsight.yard.placement.checks import _stray_shares
+from barsight.yard.placement.clearance import (
     BEAM_CLEAR_M,
     MAX_NARROW_RISE_M,
     MAX_RISE_M,
@@ -19,9 +22,6 @@ from barsight.yard.lifting.clearance import (
     FacePlane,
     find_obstacle,
 )
-from barsight.yard.magnet.footprint import Placement
-from barsight.yard.magnet.holding import _sum_pull
-from barsight.yard.map_lookup import interpolate_height
 from barsight.yard.types import HeightMap
 from barsight.yard.unseen import wide_parts
 from lift_yards import MAGNET, Laid, laid, map_of, record

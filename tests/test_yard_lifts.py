@@ -29,7 +29,6 @@ from barsight.yard.lifting import targets
 from barsight.yard.lifting.assessment import assess_placement
 from barsight.yard.lifting.lift import Lift
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
-from barsight.yard.lifting.load import reaches_area
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import disturbed_checks, validity
@@ -44,6 +43,7 @@ from barsight.yard.magnet.holding import (
     weakest_pole,
 )
 from barsight.yard.magnet.resting_plane import rest_plane
+from barsight.yard.placement.load import reaches_area
 from barsight.yard.types import Doubt, DoubtKind
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass

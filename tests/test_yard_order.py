@@ -16,11 +16,11 @@ from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.lift_file import lifts_content
-from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts, travel_height
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.placement.load import Load
 from barsight.yard.stability.blockers import find_blocked
 from barsight.yard.stability.stability import footing_checks, footings
 from barsight.yard.types import Bundle, HeightMap

@@ -14,11 +14,11 @@ from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import find_bearing
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, laid_at, reaches_area
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import put_down
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.load import Load, laid_at, reaches_area
 from barsight.yard.types import HeightMap
 from barsight.yard.weight import load_centre
 from lift_yards import LENGTH_M, MAGNET, SETTINGS, judged, laid, map_of, record

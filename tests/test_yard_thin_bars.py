@@ -14,8 +14,8 @@ from barsight.bundle_pictures.crossing_edges import with_edge
 from barsight.core.errors import ConfigError
 from barsight.yard.bundles.layers import check_uncovered
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.thin_bars import beside_checks, may_reach, thin_bar_checks
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.thin_bars import beside_checks, may_reach, thin_bar_checks
 from barsight.yard.thin_lines import (
     BESIDE_RATIO,
     MAX_STRENGTH,

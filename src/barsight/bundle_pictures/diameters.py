@@ -12,7 +12,7 @@ from barsight.bundle_pictures.spectra import DIAMETERS_M, fit_diameters, log_spe
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.irregular import DIAMETER_RATIOS
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.lifting.load import is_one_bar
+from barsight.yard.placement.load import is_one_bar
 from barsight.yard.types import Bundle
 
 _SHAPE_SIGMA, _, _ONE_BAR_SIGMA = DIAMETER_RATIOS

@@ -16,7 +16,7 @@ from barsight.bundle_pictures.strap_ends import StrapEnds, find_straps, strap_wi
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.bundles.floor import find_floor
-from barsight.yard.lifting.load import is_one_bar
+from barsight.yard.placement.load import is_one_bar
 from barsight.yard.types import Bundle, YardMap
 
 

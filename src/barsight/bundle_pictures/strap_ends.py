@@ -25,7 +25,7 @@ from barsight.bundle_pictures.samples import (
 )
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.bundles.section.straps import APART_M, DENSE_M, strongest_lines
-from barsight.yard.lifting.load import is_one_bar
+from barsight.yard.placement.load import is_one_bar
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
 

@@ -15,12 +15,12 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.yard.cameras import Cameras
-from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift import FurtherPass, Lift, UnseenPlaces
 from barsight.yard.lifting.targets import LiftPlan
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.map_lookup import lookup_heights, nearest_cells
+from barsight.yard.placement.clearance import FacePlane, find_obstacle
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, DoubtKind, HeightMap, YardMap
 

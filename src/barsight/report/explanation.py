@@ -23,12 +23,12 @@ from barsight.yard.axes import corners
 from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts, read_unseen
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import over_map_m
 from barsight.yard.map_lookup import lookup_heights
+from barsight.yard.placement.clearance import FacePlane, find_obstacle
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
 from barsight.yard.vetoes import Veto

@@ -26,8 +26,8 @@ from barsight.yard.axes import corners, gap_between
 from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
-from barsight.yard.lifting.load import laid_at
 from barsight.yard.magnet.description import MagnetOffset
+from barsight.yard.placement.load import laid_at
 
 with extra("store"):
     from sqlalchemy import Connection, Row, select

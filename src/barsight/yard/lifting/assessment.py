@@ -9,29 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.checks import (
-    area_checks,
-    count_checks,
-    face_checks,
-    load_checks,
-    probability_check,
-    unknown_check,
-)
-from barsight.yard.lifting.clearance import (
-    FacePlane,
-    clearance_checks,
-    find_obstacle,
-)
-from barsight.yard.lifting.labels import SeenLabel, find_labels, rests_on_label
 from barsight.yard.lifting.lift import Lift, LiftScene
-from barsight.yard.lifting.load import leaning_checks, resting_checks
-from barsight.yard.lifting.thin_bars import (
-    beside_checks,
-    edge_checks,
-    has_pictures,
-    may_reach,
-    thin_bar_checks,
-)
 from barsight.yard.lifting.travel_accuracy import crane_checks, target_covariance
 from barsight.yard.lifting.validity import age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -56,6 +34,28 @@ from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.magnet.seen_edges import seen_clearances
 from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.placement.checks import (
+    area_checks,
+    count_checks,
+    face_checks,
+    load_checks,
+    probability_check,
+    unknown_check,
+)
+from barsight.yard.placement.clearance import (
+    FacePlane,
+    clearance_checks,
+    find_obstacle,
+)
+from barsight.yard.placement.labels import SeenLabel, find_labels, rests_on_label
+from barsight.yard.placement.load import leaning_checks, resting_checks
+from barsight.yard.placement.thin_bars import (
+    beside_checks,
+    edge_checks,
+    has_pictures,
+    may_reach,
+    thin_bar_checks,
+)
 from barsight.yard.stability.stability import footing_checks
 from barsight.yard.types import Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import Check, check_min, check_true, vetoes_of

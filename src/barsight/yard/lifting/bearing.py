@@ -12,10 +12,10 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.yard.axes import axes_of
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.placement.load import Load
 from barsight.yard.sections import part_about
 from barsight.yard.types import YardMap
 from barsight.yard.unseen import wide_parts

@@ -11,7 +11,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.yard.axes import axes_of
 from barsight.yard.events import YardEvent
-from barsight.yard.lifting.load import Load
+from barsight.yard.placement.load import Load
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
 from barsight.yard.unseen import wide_parts

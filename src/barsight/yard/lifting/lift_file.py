@@ -19,12 +19,12 @@ from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.lift import Lift, UnseenPlaces
-from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
 from barsight.yard.lifting.validity import disturbed_checks, is_ahead
 from barsight.yard.magnet.description import Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.load import Load, laid_at
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Veto, vetoes_of

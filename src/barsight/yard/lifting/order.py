@@ -18,10 +18,10 @@ from barsight.yard.events import events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.ground import SHADOW_M, Ground
-from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import LiftPlan, ended_with_floor, put_down
 from barsight.yard.magnet.description import Magnet
+from barsight.yard.placement.load import Load
 from barsight.yard.types import Bundle, YardMap
 
 

@@ -23,10 +23,10 @@ from barsight.yard.lifting.bearing import (
     placing_slack,
 )
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import old_cells
 from barsight.yard.magnet.description import MAX_TURN_DEG, Magnet
+from barsight.yard.placement.load import Load, reached_areas
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 

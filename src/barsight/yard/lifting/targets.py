@@ -19,12 +19,12 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import assess_placement
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.lift import Lift, LiftScene, UnseenPlaces
-from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_checks, validity
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BundleTable, Placement
+from barsight.yard.placement.load import Load, laid_at
 from barsight.yard.sections import part_about, split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides

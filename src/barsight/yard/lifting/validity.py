@@ -14,12 +14,12 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.yard.axes import axes_of, corners, gap_between
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.placement.clearance import STRAY_FIELD_M
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 

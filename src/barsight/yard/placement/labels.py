@@ -14,12 +14,12 @@ from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.contact import Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.resting_plane import SEGMENT_M
 from barsight.yard.map_lookup import SATURATED_LEVEL, nearest_cells, sample_levels
+from barsight.yard.placement.clearance import FacePlane
 from barsight.yard.plates import STEP_M, WHITE_LEVEL, plate_masks
 from barsight.yard.types import HeightMap
 

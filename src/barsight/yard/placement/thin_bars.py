@@ -9,9 +9,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.placement.clearance import STRAY_FIELD_M
 from barsight.yard.thin_lines import MAX_SLOPE, ThinLine
 from barsight.yard.types import Bundle, DoubtKind, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true

@@ -10,12 +10,12 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, frozen, kernel
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.map_lookup import interpolate_height
+from barsight.yard.placement.load import Load, reached_areas
 from barsight.yard.types import ENDS, Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
