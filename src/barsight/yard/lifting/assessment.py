@@ -199,7 +199,7 @@ def _grip(
     """Count the bundles that the poles take, bounded by how far each one reaches on the map."""
     reached = reached_strips(heights, place, magnet, tolerance, contact.map_z_m)
     held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached)
-    clear = seen_clearances(held, heights, place, near, contact.map_z_m - magnet.reach_m, reached)
+    clear = seen_clearances(held, heights, place, magnet, tolerance, near, contact.map_z_m, reached)
     held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached, clear)
     return without_parted(held, heights, place, near, reached)
 

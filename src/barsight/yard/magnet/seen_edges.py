@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
 from barsight.yard.magnet.reach import DEEPER_M, MAX_SKEW, parts_beside
 from barsight.yard.magnet.resting_plane import ALL, SEEN, U, Z, profiles
@@ -37,21 +38,32 @@ _LAST_M = 0.01
 
 
 def seen_clearances(
-    held: Grip, heights: HeightMap, place: Placement, table: BundleTable, reach_z_m: Float64, reached: Float64
-) -> Float64:
+    held: Grip, heights: HeightMap, place: Placement, magnet: Magnet, tolerance: Tolerance,
+    table: BundleTable, face_z_m: Float64, reached: Float64,
+) -> Float64:  # fmt: skip
     """Compute by how much (B, P) each pole certainly reaches the gripped bundles, and misses the others, as
     their surface shows; -inf where it doesn't show all along the pole, or doesn't matter to the count.
 
-    reach_z_m: (P,) lowest height that each pole reaches. reached: (P, 4) of `reach.reached_strips`.
+    tolerance: of the crane's set-down; a hard bound. face_z_m: (P,) height of each pole's face. reached: (P,
+    4) of `reach.reached_strips`.
     """
     clear = np.full((len(table.bundles), len(reached)), -np.inf)
+    reach_z_m, faces = face_z_m - magnet.reach_m, _faces(place, magnet, tolerance)
     for number, bundle in enumerate(table.bundles):
         if held.flips[number] <= _SLIGHT or abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > MAX_SKEW:
             continue
         looked = _looked(bundle, place, reached, is_gripped=number in held.gripped)
         if looked:
-            clear[number] = _clearances(looked, bundle.width_m / 2, heights, place, reach_z_m, reached)
+            half_m = bundle.width_m / 2
+            clear[number] = _clearances(looked, half_m, heights, place, reach_z_m, faces)
     return clear
+
+
+def _faces(place: Placement, magnet: Magnet, tolerance: Tolerance) -> Float64:
+    """List the faces (P, 3), m: middle across, half the width, and how far aside the crane may set it."""
+    along, across, length, width = magnet.pole_table.T
+    turned = math.radians(tolerance.yaw_deg) * (np.abs(along) + length / 2)
+    return np.column_stack([across, width / 2, turned + float(tolerance.along(place.across))])
 
 
 @dataclass(frozen=True)
@@ -84,9 +96,11 @@ def _looked(bundle: Bundle, place: Placement, reached: Float64, *, is_gripped: b
 
 def _clearances(
     looked: list[_Look], half_m: float, heights: HeightMap, place: Placement, reach_z_m: Float64,
-    reached: Float64,
+    faces: Float64,
 ) -> Float64:  # fmt: skip
-    """Compute the values (P,) of one bundle; see `seen_clearances`. half_m: half its width."""
+    """Compute the values (P,) of one bundle; see `seen_clearances`. half_m: half its width. faces: of
+    `_faces`.
+    """
     clear = np.full(reach_z_m.size, np.inf)
     shapes, points = profiles(heights, place, np.array([look.cut for look in looked]))
     first = 0
@@ -95,8 +109,9 @@ def _clearances(
         first += across * along
         over = np.where(own[:, SEEN] >= _SEEN_RATIO * own[:, ALL], own[:, Z], np.nan) - reach_z_m[look.pole]
         if look.side == 0:
-            aside = np.abs(own[:, U] - reached[look.pole, 1])[over >= 0]
-            found = reached[look.pole, 3] / 2 - aside.min(initial=np.inf)
+            middle, half, slack = faces[look.pole]
+            middles = middle + slack * np.array([[-1.0], [0.0], [1.0]])
+            found = half - np.abs(own[over >= 0, U] - middles).min(axis=1, initial=np.inf).max()
         elif look.clear_m <= _MIDDLE_M:
             found = -np.inf
         else:
