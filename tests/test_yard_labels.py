@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barsight.yard.lifting import labels
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.holding import weakest_bundle
+from barsight.yard.placement import labels
 from barsight.yard.placement.clearance import FacePlane
 from barsight.yard.placement.labels import find_labels, rests_on_label
 from barsight.yard.plates import plate_masks
@@ -92,6 +93,22 @@ def test_thin_bars_are_held_on_one_label_and_the_pull_on_it_is_told(
     assert bool(codes(lift)) == bool(told) and all(told in veto.reason for veto in lift.vetoes)
     if labels_m and not told:
         assert lift.contact.pull_low_n < 0.97 * bare.contact.pull_low_n and lift.safety < bare.safety
+
+
+def test_a_plate_on_one_bundle_touches_no_other_one() -> None:
+    """A label that holds the faces 5 mm off both bundles bears the one under it alone."""
+    magnet = replace(MAGNET, poles=tuple(replace(pole, width_m=0.6) for pole in MAGNET.poles))
+    stock = [laid(x_m, bars=61, diameter_m=0.03) for x_m in (0.3, 0.62)]
+    load, place = tuple(record(one, k) for k, one in enumerate(stock)), replace(PLACE, x_m=0.46)
+    contact = rest_magnet(map_of(stock, sigma_m=0.0005), place, magnet, 0.003)
+    assert contact is not None
+    off = replace(
+        contact, plate_m=np.array([(v, u) for v in (-2.1, 2.1) for u in (-0.22, -0.1)]),
+        poles=tuple(replace(pole, gap_map_m=pole.gap_map_m + 0.005) for pole in contact.poles),
+    )  # fmt: skip
+    assert weakest_bundle(contact, magnet, place, load, SETTINGS.strap_m) > 1
+    assert weakest_bundle(off, magnet, place, load, SETTINGS.strap_m) == 0
+    assert weakest_bundle(off, magnet, place, load[:1] * 2, SETTINGS.strap_m) > 1
 
 
 def test_a_plate_is_at_least_as_thick_as_the_map_shows() -> None:

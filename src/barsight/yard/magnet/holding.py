@@ -249,7 +249,8 @@ def weakest_bundle(
     how it pries itself off (`pried_ratio`); return the minimum. Infinite where one or none is taken, NaN
     where a weight isn't known.
 
-    Only the cells of a face that certainly lie over a bundle's outline pull and touch it.
+    Only the cells of a face that certainly lie over a bundle's outline pull and touch it, and so does a
+    plate.
     """
     if len(load) < 2:
         return math.inf
@@ -259,7 +260,8 @@ def weakest_bundle(
             replace(own, gap_map_m=np.where(_over(bundle, pole, place, own), own.gap_map_m, np.nan))
             for own, pole in zip(contact.poles, magnet.poles, strict=True)
         )
-        held = _pulled(replace(contact, poles=poles), magnet, (bundle,), strap_m)
+        plate_m = contact.plate_m[_contains(bundle, contact.plate_m, place)]
+        held = _pulled(replace(contact, poles=poles, plate_m=plate_m), magnet, (bundle,), strap_m)
         needed_n = bundle_mass(bundle).upper_kg * NEWTON_PER_KG * magnet.needed_factor
         if not needed_n > 0:
             return math.nan
@@ -272,8 +274,12 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
     shape = own.gap_map_m.shape
     u = pole.across_m + pole.width_m * ((np.arange(shape[0]) + 0.5) / shape[0] - 0.5)
     v = pole.along_m + pole.length_m * ((np.arange(shape[1]) + 0.5) / shape[1] - 0.5)
-    at = np.array([place.x_m, place.y_m]) - bundle.centre_m[:2]
-    at = at + u[:, None, None] * place.across + v[None, :, None] * place.along
+    return _contains(bundle, np.stack(np.broadcast_arrays(v, u[:, None]), axis=-1), place)
+
+
+def _contains(bundle: Bundle, grid_m: Float64, place: Placement) -> Bool:
+    """Mark the places (..., 2), along and across the beam, that certainly lie over a bundle's outline."""
+    at = grid_m @ place.beam_axes + (place.x_m, place.y_m) - bundle.centre_m[:2]
     sigma, (across, along) = bundle.sigma, bundle.axes
     sigmas = np.array([(sigma.lateral_m, sigma.width_m / 2), (sigma.along_m, sigma.length_m / 2)])
     half = np.array([bundle.width_m, bundle.length_m]) / 2
