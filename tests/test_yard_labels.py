@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from barsight.yard.lifting.assessment import Hold
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
@@ -93,6 +94,24 @@ def test_thin_bars_are_held_on_one_label_and_the_pull_on_it_is_told(
     assert bool(codes(lift)) == bool(told) and all(told in veto.reason for veto in lift.vetoes)
     if labels_m and not told:
         assert lift.contact.pull_low_n < 0.97 * bare.contact.pull_low_n and lift.safety < bare.safety
+
+
+def test_a_lift_is_no_safer_than_on_any_part_of_a_label() -> None:
+    """Beside the middle of a face the least pull and the weakest pole are those of different parts."""
+    one = laid(0.3, bars=61, diameter_m=0.03)
+    heights, load = map_of([one], x_m=(-1.5, 2.0), sigma_m=0.0005), (record(one),)
+    gray = np.full(heights.shape, 90, np.uint8)
+    gray[np.ix_(np.abs(heights.y_m + 2.4) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)] = 250
+    heights = replace(heights, gray=gray)
+    lift = judged([one], load, PLACE, heights=heights)
+    (label,) = find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))
+    held = [
+        Hold.of(contact, PLACE, MAGNET, load, lift.needed_n, SETTINGS)
+        for contact in rests_on_label(label, PLACE, heights, MAGNET, SETTINGS)
+    ]
+    least = min(hold.weakest.ratio for hold in held if hold.weakest)
+    assert codes(lift) == set() and lift.contact is not None and lift.safety <= least
+    assert lift.contact.pull_low_n == min(hold.contact.pull_low_n for hold in held)
 
 
 def test_a_plate_on_one_bundle_touches_no_other_one() -> None:

@@ -91,6 +91,13 @@ class Hold:
             weakest_bundle(contact, magnet, place, load, settings.strap_m),
         )  # fmt: skip
 
+    def weaker(self, other: Hold) -> Hold:
+        """Take the contact of the smaller pull, and the minimum of each ratio."""
+        contact = min(self.contact, other.contact, key=lambda either: either.pull_low_n)
+        poles = [one.weakest for one in (self, other) if one.weakest]
+        weakest = min(poles, key=lambda pole: pole.ratio, default=None)
+        return Hold(contact, weakest, min(self.pried, other.pried), min(self.worst, other.worst))
+
     def checks(
         self, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
         settings: LiftSettings,
@@ -166,7 +173,7 @@ def _on_label(
     hold: Hold, place: Placement, yard: LiftScene, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
     settings: LiftSettings,
 ) -> tuple[Hold, list[Check]]:  # fmt: skip
-    """Check that the faces hold the load wherever a label under one may bear them; with the weakest hold."""
+    """Check that the faces hold the load wherever a label under one may bear them; and the weakest hold."""
     if yard.heights.gray is None:
         return hold, []
     labels = find_labels(place, yard.heights, magnet, FacePlane.of(hold.contact))
@@ -182,7 +189,7 @@ def _on_label(
         if failed:
             reason = failed[0].reason
             break
-        hold = min(hold, one, key=lambda either: either.contact.pull_low_n)
+        hold = hold.weaker(one)
     if reason:
         along, across = labels[0].place_under(place)
         reason = (
