@@ -51,9 +51,9 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
 
 def over_map_m(load: tuple[Bundle, ...], strap_m: float) -> float:
     """Estimate how much higher (m) than a map shows faces lie on a load: by half of what may be cut off its
-    crests, and by a strap.
+    crests, and by a strap. Crests of bars of unknown diameter count as shown.
     """
-    return _max_cut_m(load)[1] / 2 + strap_m if load else 0.0
+    return float(np.nan_to_num(_max_cut_m(load)[1])) / 2 + strap_m if load else 0.0
 
 
 def _pulled(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:

@@ -186,7 +186,7 @@ def _lowest_m(place: Placement, magnet: Magnet, load: tuple[Bundle, ...], roll_r
         across, sigma = bundle.axes[0], bundle.sigma
         turned, level = float(across @ place.along), float(across @ place.across)
         middle = -(at - bundle.centre_m[:2]) @ across * np.sign(level)
-        reach = (bundle.width_m - min_diameter_m(bundle)) / 2
+        reach = (bundle.width_m - float(np.nan_to_num(min_diameter_m(bundle)))) / 2
         reach += UPPER * math.hypot(known_sigma(sigma.lateral_m), known_sigma(sigma.width_m) / 2)
         # Bars askew under the beam cross a face: the outermost one is furthest out at the end of the face.
         crest = reach - math.copysign(1.0, roll_rad) * middle + abs(turned) * (poles[:, 2] / 2 + far)
