@@ -62,6 +62,26 @@ def test_a_bundle_beside_its_neighbour_isnt_told_to_stand_over_the_gully_between
     assert left.overhang_side == right.overhang_side == 0 and left.lean_deg == 0
 
 
+@pytest.mark.parametrize("aisle_m", [0.25, 0.8])
+def test_a_bundle_over_the_edge_stands_over_beside_an_aisle_whose_floor_isnt_seen(aisle_m: float) -> None:
+    edge = 0.1 + laid(0.0).width_m / 2
+    beyond = edge + aisle_m + laid(0.0).width_m / 2
+    stock = [laid(0.0), laid(beyond), laid(beyond, z=0.56), laid(0.1, z=0.56)]
+    bundles = tuple(record(one, k, layer=int(one.z_m > 0.5)) for k, one in enumerate(stock))
+    heights = map_of(stock)
+    aisle = (heights.x_m > edge - 0.01) & (heights.x_m < edge + aisle_m + 0.01)
+    heights.z_m[:, aisle], heights.source[:, aisle] = np.nan, HeightSource.UNKNOWN
+    over = footings(heights, bundles, SETTINGS)[-1]
+    assert over.overhang_side == 1 and over.overhang_m == pytest.approx(0.1, abs=0.02)
+
+
+def test_the_bundle_that_one_over_its_edge_rests_on_without_dunnage_is_none_beside_it() -> None:
+    stock = [laid(0.0), laid(0.13, z=laid(0.0).z_m + 0.26)]
+    bundles = tuple(record(one, k, layer=k) for k, one in enumerate(stock))
+    over = footings(map_of(stock), bundles, SETTINGS)[-1]
+    assert over.overhang_side == 1 and over.overhang_m == pytest.approx(0.13, abs=0.02)
+
+
 def test_the_stated_sigmas_hold() -> None:
     rng = np.random.default_rng(5)
 

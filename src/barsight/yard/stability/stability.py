@@ -34,6 +34,11 @@ FREE_RATIO = 1.2
 """Minimum drop beside a bundle, in its widths, that reaches below its support."""
 SHOULDER_M = 0.06
 """Maximum distance (m) from a bundle's edge at which its own shoulder shows."""
+FLANKED_M, FLANKED_RATIO = 0.15, 0.5
+"""Maximum distance (m) from a bundle's edge of a neighbour in its layer beside which no edge of what carries
+it is told; minimum height of the neighbour's surface over the bundle's underside, in widths: bundles that it
+rests on without dunnage, side by side, reach 0.13 widths above it.
+"""
 LEVEL_M = 0.05
 """Height (m) over the lowest place beside a bundle, or over the floor, that counts as level with it."""
 SHEER_M = 0.15
@@ -122,13 +127,14 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
 
 
 def _is_flanked(profile: Float64, bundle: Bundle) -> bool:
-    """Check whether something higher than the bundle's underside stands beside it before a place below its
-    support is seen, as a bundle of its own layer does: what carries both goes on there, or isn't known.
+    """Check whether something well above the bundle's underside stands close beside it before a place below
+    its support is seen, as a bundle of its own layer does: what carries both goes on there, or isn't known.
     """
     z = np.where(profile[:, 1] >= MIN_KNOWN, profile[:, 0], np.nan)
     falls = np.flatnonzero(z <= _below_support(bundle))
-    beside = z[round(SHOULDER_M / STEP_M) : falls[0] if falls.size else None]
-    return bool((beside > bundle.top_z_m - bundle.width_m).any())
+    end = min(int(falls[0]) if falls.size else len(z), round(FLANKED_M / STEP_M) + 1)
+    beside = z[round(SHOULDER_M / STEP_M) : end]
+    return bool((beside > bundle.top_z_m - (1 - FLANKED_RATIO) * bundle.width_m).any())
 
 
 def _below_support(bundle: Bundle) -> float:
