@@ -63,12 +63,15 @@ def test_an_end_near_the_maps_edge_needs_less_of_the_floor_behind_it(beyond_m: f
         assert found.length_m == pytest.approx(one.length_m, abs=2 * found.sigma.length_m)
 
 
-def test_bars_may_go_on_in_what_the_map_misses_before_the_floor_shows() -> None:
+@pytest.mark.parametrize("lower_m", [0.0, 0.02])
+def test_bars_may_go_on_in_what_the_map_misses_before_the_floor_shows(lower_m: float) -> None:
+    """lower_m: length over which heights fall off where the hole begins."""
     one = Laid(0.5, 0.0, 0.2, 0.0, length_m=3.0)
     heights = draw([one])
     (whole,) = find_bundles(heights, SETTINGS)
-    y = heights.y_m[:, None]
-    lost = (y > 1.3) & (y < 1.52) & (np.abs(heights.x_m - 0.5) < 0.2)
+    y, over = heights.y_m[:, None], np.abs(heights.x_m - 0.5) < 0.2
+    heights.z_m[(y > 1.2) & (y < 1.52) & over] = 0.0
+    lost = (y > 1.2 + lower_m) & (y < 1.52) & over
     heights.z_m[lost], heights.source[lost] = np.nan, HeightSource.UNKNOWN
     (found,) = find_bundles(heights, SETTINGS)
     assert found.ends_open == (False, False)

@@ -39,8 +39,8 @@ _UNEVEN_SIGMAS, _RAGGED_RATIO = 2.0, 0.35
 hidden ones may end elsewhere; fraction of the length over which the surface goes on a little lower.
 """
 _BLURRED_M, _UNSEEN_RATIO = 0.06, 0.5
-"""Length (m) between a bundle's last row and the first one that is proven deep in which nothing is known at a
-seen end; part of an end's sigma, as a fraction of what exceeds it: the bars may go on there.
+"""Length (m) beyond a bundle's last row, before _EDGE_PROOF_M in all are proven deep, of which nothing is
+known at a seen end; part of an end's sigma, as a fraction of what exceeds it: the bars may go on there.
 """
 _UNEVEN_M = (-0.15, 0.2)
 _ENDS_M = 0.03
@@ -93,7 +93,8 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings, he
                 return _open_end(v, "the surface goes on at about its height", lower)
         elif known[k] >= _MAX_VALUE:
             lower, clear = lower + 1, clear + 1
-            unseen = k - ragged if clear == 1 else unseen
+            if clear * cell <= _EDGE_PROOF_M:
+                unseen = k + 1 - ragged - clear
             if lower * cell >= _PROOF_M:
                 break
     if lower * cell < _PROOF_M and clear * cell < _EDGE_PROOF_M:
