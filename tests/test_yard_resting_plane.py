@@ -151,21 +151,21 @@ def test_poles_and_bundles_overlap_where_their_rectangles_meet() -> None:
     for _ in range(300):
         dx, dy = rng.uniform(-1, 1, 2)
         yaw, turn = rng.uniform(-1.5, 1.5, 2)
-        half_width, half_length = rng.uniform(0.02, 0.3), rng.uniform(0.2, 0.8)
+        half = rng.uniform((0.02, 0.2), (0.3, 0.8))
         along = np.array([-math.sin(turn), math.cos(turn)])
         depth, sigma, slack = overlap(
-            dx, dy, math.cos(yaw), math.sin(yaw), pole, along, half_width, half_length, nothing, np.zeros(3)
+            dx, dy, math.cos(yaw), math.sin(yaw), pole, along, half, nothing, np.zeros(3), 0.0
         )
         one = ((dx, dy), (0.1, 0.9), math.degrees(yaw))
-        other = ((0.0, 0.0), (2 * half_width, 2 * half_length), math.degrees(turn))
+        other = ((0.0, 0.0), tuple(2 * half), math.degrees(turn))
         met.append(cv2.rotatedRectangleIntersection(one, other)[0] != cv2.INTERSECT_NONE)
         assert (depth > 0) == met[-1] or abs(depth) < 1e-6
         assert (sigma, slack) == (0.001, 0.0)
     assert 0.2 < np.mean(met) < 0.8
     # Pole along the bundle's side: across counts the place's sigma, the half width's, and the yaw's by 0.3 m.
     sides = overlap(
-        0.1, 0.3, 1.0, 0.0, pole, np.array([0.0, 1.0]), 0.1, 1.0,
-        np.array([0.003, 0.05, 0.01, 0.004, 0.05]), np.array([0.02, 0.5, 0.0]),
+        0.1, 0.3, 1.0, 0.0, pole, np.array([0.0, 1.0]), np.array([0.1, 1.0]),
+        np.array([0.003, 0.05, 0.01, 0.004, 0.05]), np.array([0.02, 0.5, 0.0]), 0.3,
     )  # fmt: skip
     assert sides == pytest.approx((0.05, math.sqrt(9e-6 + 9e-6 + 16e-6 + 1e-6), 0.02))
 

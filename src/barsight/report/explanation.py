@@ -28,7 +28,7 @@ from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import over_map_m
 from barsight.yard.map_lookup import lookup_heights
-from barsight.yard.placement.clearance import FacePlane, find_obstacle
+from barsight.yard.placement.clearance import HIGHEST_OBJECT, FacePlane, find_obstacle
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
 from barsight.yard.vetoes import Veto
@@ -165,8 +165,7 @@ def draw_place(
     wide = max(magnet.beam.width_m / 2, *(abs(p.across_m) + p.width_m / 2 for p in magnet.poles)) + BEYOND_M
     reach = math.hypot(long, wide) * np.array([-1, 1])
     part = part_about(heights, place.x_m + reach, place.y_m + reach)
-    # The first check of obstacles states the sigma that they are judged with.
-    sigma_mm = next(check["sigma"] for check in record["checks"] if check["code"] == "obstructed")
+    sigma_mm = next(check["sigma"] for check in record["checks"] if check["what"] == HIGHEST_OBJECT)
     load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
     faces = FacePlane(
         target["z_m"] - over_map_m(load, settings.strap_m), math.radians(record["pitch_deg"]),

@@ -44,6 +44,7 @@ MAX_HOLE_BESIDE_M = 0.04
 """The same beside the load: around a post, wrong matches make its edge look free."""
 FLANK_M = 0.03
 """Distance (m) from the load within which an unseen place is the load's own flank."""
+HIGHEST_OBJECT = "highest object above the plane of the faces, under or beside the magnet"
 _HOLE_CELLS, _HOLE_BESIDE_CELLS = round(MAX_HOLE_M / STEP_M), round(MAX_HOLE_BESIDE_M / STEP_M)
 _BEAM_ONLY = 2
 _NO_BOUNDS = np.empty((0, 0), np.float32)
@@ -97,8 +98,7 @@ def clearance_checks(
     obstacle = find_obstacle(place, heights, magnet, faces, load)
     checks = []
     for code, what, bound_mm in (
-        ("obstructed", "highest object above the plane of the faces, under or beside the magnet",
-         1e3 * MAX_RISE_M),
+        ("obstructed", HIGHEST_OBJECT, 1e3 * MAX_RISE_M),
         ("unknown-under-footprint", "widest place under or beside the magnet that was neither seen nor "
          f"proven free; beside the load the limit is {1e3 * MAX_HOLE_BESIDE_M:.0f} mm", 1e3 * MAX_HOLE_M),
     ):  # fmt: skip
