@@ -131,11 +131,11 @@ def test_a_map_turns_and_mirrors_with_its_yard(seed: int) -> None:
     moved = mapped([view(x + 300, y - 700, z) for x, y, z in views], (300, -700))
     same_map(moved, expected)
     turned = mapped([view(SIDE - 1 - y, x, z) for x, y, z in views])
-    # Of directions that are alike the first is taken, and a turn changes which is the first: one of the 576
-    # cells at most, on 9 of the seeds 0 to 399.
+    # Of directions that are alike the first is taken, and a turn changes which is the first: of the 576
+    # cells one on 92 and two on one of the seeds 400 to 2536 and 6000 to 8128.
     for name in ("z_m", "sigma_m", "views", "source"):
         alike = np.isclose(getattr(turned, name), np.rot90(getattr(expected, name), -1), rtol=2e-5, atol=1e-6)
-        assert np.count_nonzero(~alike) <= 1, name
+        assert np.count_nonzero(~alike) <= 3, name
 
 
 @FEWER
