@@ -135,7 +135,7 @@ def test_a_map_turns_and_mirrors_with_its_yard(seed: int) -> None:
     # cells one on 92 and two on one of the seeds 400 to 2536 and 6000 to 8128.
     for name in ("z_m", "sigma_m", "views", "source"):
         alike = np.isclose(getattr(turned, name), np.rot90(getattr(expected, name), -1), rtol=2e-5, atol=1e-6)
-        assert np.count_nonzero(~alike) <= 3, name
+        assert np.count_nonzero(~alike) <= 2, name
 
 
 @FEWER

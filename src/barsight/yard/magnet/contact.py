@@ -136,9 +136,10 @@ def rest_magnet(
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
     touch_gap = contact_gap_m + noise
     table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
-    sigma, gap = points[seen, SIGMA], (height + roll * u + pitch * v - z)[: seen.sum()]
+    touches, sigma = height + roll * u + pitch * v - z <= touch_gap, points[seen, SIGMA]
+    on_map, on_plate = np.split(touches, [sigma.size])
     # Faces that rest on a plate alone may touch none of the map.
-    touched = sigma[gap <= touch_gap] if (gap <= touch_gap).any() else sigma
+    touched = sigma[on_map] if on_map.any() else sigma
     faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
     found, first = [], 0
     for number, (columns, parts) in enumerate(shape):
@@ -160,7 +161,7 @@ def rest_magnet(
         noise,
         touch_gap,
         tuple(found),
-        plate[height + roll * plate[:, 1] + pitch * plate[:, 0] - plate[:, 2] <= touch_gap, :2],
+        plate[on_plate, :2],
     )
 
 

@@ -27,8 +27,8 @@ HEIGHT_SIGMA_M = 0.005
 SURELY = 3.0
 """Number of sigmas by which a place must lie within a bundle's ends to belong to it with certainty."""
 SEEN_EDGE_SIGMA_M = 0.006
-"""Standard deviation (m) of the place where a bundle's surface is seen to sink out of a pole's reach: in 99.9
-of 100 parts of a pole it lies at most 18 mm further out than told.
+"""Standard deviation (m) of the place where a bundle's surface is seen to sink out of a pole's reach: at
+999 of 1,000 parts of poles it lies at most 18 mm further out than told.
 """
 MAX_TOP_SIGMA_M = 0.008
 """Upper bound (m) of a top's sigma: the faces rest on the same map, so what all places share of that sigma
