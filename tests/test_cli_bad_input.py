@@ -219,6 +219,29 @@ main.main()
     assert done.stderr == "barsight: interrupted; nothing half-written is left\n"
 
 
+def test_an_interrupt_inside_a_finalizer_is_raised_again(tmp_path: Path) -> None:
+    """Python lets no exception out of `__del__`: it prints a traceback, and the run would go on."""
+    (tmp_path / "finalized.py").write_text("""
+import importlib, os, signal, sys, time, types
+from barsight.cli import main
+class Held:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+def run(_):
+    Held()
+    time.sleep(10)
+    print("went on")
+importlib.import_module = lambda _: types.SimpleNamespace(run=run)
+sys.argv = ["barsight", "info"]
+main.main()
+""")
+    command = [sys.executable, "-m", "finalized"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "barsight: interrupted; nothing half-written is left\n"
+
+
 def test_an_interrupt_that_a_library_hides_is_one_still(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,6 +64,8 @@ _interrupts: list[int] = []
 """Signals that have interrupted this run."""
 _AGAIN_S = 20.0
 """Time in seconds that a run has to clean up before it is interrupted again."""
+_AT_ONCE_S = 0.001
+"""Time in seconds until an interrupt that was lost is raised again."""
 
 
 def home(name: str) -> str:
@@ -83,6 +85,7 @@ def main() -> None:
         signal.signal(hangup, _interrupt)
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # libraries' notes to programmers would clutter the one-line error
+    sys.unraisablehook = _unraisable
     code = run_and_print(sys.argv[1:])
     if code == INTERRUPTED:
         _leave_at_once(code)
@@ -163,15 +166,27 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     for again in (signal.SIGINT, signal.SIGTERM):
         signal.signal(again, signal.SIG_IGN)  # a second signal must not cut the clean-up short
     _interrupts.append(number)
-    if hasattr(signal, "setitimer"):
-        # A library may swallow this exception, so it is raised again if the run continues.
-        signal.signal(signal.SIGALRM, _interrupt_again)
-        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+    _interrupt_after(_AGAIN_S)  # a library may swallow this exception
     raise KeyboardInterrupt
 
 
 def _interrupt_again(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
+
+
+def _interrupt_after(seconds: float) -> None:
+    """Raise the interrupt again if the run still continues by then."""
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _interrupt_again)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def _unraisable(lost: sys.UnraisableHookArgs) -> None:
+    """Raise an interrupt again that fell into a finalizer, from which Python lets no exception out."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        _interrupt_after(_AT_ONCE_S)
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _leave_at_once(code: int) -> None:
