@@ -15,6 +15,7 @@ from barsight.yard.cameras import BORDER_PX, Cameras
 from barsight.yard.lifting.lift import FurtherPass, UnseenPlaces
 from barsight.yard.lifting.targets import LiftPlan, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.map_lookup import CellGrid
 from barsight.yard.types import Bundle, HeightMap
 from lift_yards import LENGTH_M, MAGNET, SETTINGS, bare, laid, map_of, record, sure_travel
 
@@ -38,6 +39,10 @@ def travel(y_m: float) -> Travel:
     return replace(sure_travel(places, np.arange(1, 6) * 10**9), cameras=cameras())
 
 
+def count_views(body_m: Float64, heights: HeightMap, places_m: Float64, enough: int = 9) -> Int64:
+    return cameras().count_views(body_m, CellGrid.of(heights), places_m, enough)
+
+
 def planned(heights: HeightMap, bundle: Bundle, way: Travel) -> LiftPlan:
     return plan_lifts(heights, (bundle,), MAGNET, SETTINGS, (), way, 5 * 10**9)
 
@@ -50,13 +55,15 @@ def test_a_view_shows_what_both_pictures_hold_and_nothing_hides() -> None:
     ground = np.array([[0.0, 0.8, 0.0], [0.0, 0.2, 0.0], [0.0, 0.2, 2.5]])
     for y_m, shown in ((-1.5, [0, 1, 1]), (2.5, [1, 0, 0]), (4.0, [0, 0, 0])):
         body = np.array([[0.1, y_m, EYE_M]])
-        assert cameras().count_views(body, wall, ground).tolist() == shown
+        assert count_views(body, wall, ground).tolist() == shown
     left, right = (np.array([[x, 0.0, EYE_M]]) for x in (-3.85, 3.45))
     flat = replace(wall, z_m=np.zeros_like(wall.z_m))
     place = np.zeros((1, 3))
-    assert cameras().count_views(left, flat, place) == 1 and cameras().count_views(right, flat, place) == 0
+    assert count_views(left, flat, place) == 1 and count_views(right, flat, place) == 0
+    assert count_views(np.concatenate([left] * 3), flat, place) == 3
+    assert count_views(np.concatenate([right, *[left] * 3]), flat, place, enough=2) == 2
     unknown = replace(wall, z_m=np.full_like(wall.z_m, np.nan))
-    assert cameras().count_views(np.array([[0.1, -1.5, EYE_M]]), unknown, ground).tolist() == [1, 1, 1]
+    assert count_views(np.array([[0.1, -1.5, EYE_M]]), unknown, ground).tolist() == [1, 1, 1]
 
 
 def test_an_end_beyond_the_pictures_is_shown_from_nearer_to_it() -> None:
@@ -96,11 +103,11 @@ def test_only_views_near_a_lift_are_followed(monkeypatch: pytest.MonkeyPatch) ->
     one, way, followed = laid(0.3), travel(-1.0), []
     heights = bare(map_of([one]))
     heights.z_m[heights.y_m > -1.0 + REACH * EYE_M] = np.nan
-    bundle, count_views = record(one, ends_open=(False, True)), Cameras.count_views
+    bundle, count = record(one, ends_open=(False, True)), Cameras.count_views
 
-    def counted(self: Cameras, body_m: Float64, about: HeightMap, places_m: Float64) -> Int64:
+    def counted(self: Cameras, body_m: Float64, grid: CellGrid, places_m: Float64, enough: int) -> Int64:
         followed.append(len(body_m))
-        return count_views(self, body_m, about, places_m)
+        return count(self, body_m, grid, places_m, enough)
 
     monkeypatch.setattr(Cameras, "count_views", counted)
     plan = planned(heights, bundle, way)

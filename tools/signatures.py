@@ -64,11 +64,10 @@ def compiled() -> Iterator[tuple[str, str, Any, tuple[Any, ...]]]:
 def call_others() -> None:
     """Call the kernels of lifts that are refused for what was not seen, of which the demo has none."""
     from barsight.yard.cameras import Cameras
-    from barsight.yard.types import HeightMap
+    from barsight.yard.map_lookup import CellGrid
 
-    z = np.zeros((2, 2), np.float32)
-    flat = HeightMap(0.0, 0.0, 1.0, z, z, z, z.astype(np.uint8))
-    Cameras(np.zeros((2, 3)), np.eye(3), np.zeros((2, 4))).count_views(np.ones((1, 3)), flat, np.ones((1, 3)))
+    flat, place = CellGrid(0.0, 0.0, 1.0, np.zeros((2, 2), np.float32), 0.0), np.ones((1, 3))
+    Cameras(np.zeros((2, 3)), np.eye(3), np.zeros((2, 4))).count_views(place, flat, place, 1)
 
 
 def main() -> None:

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float64
 from barsight.yard.cameras import Cameras
 from barsight.yard.lifting.lift import FurtherPass, Lift, UnseenPlaces
 from barsight.yard.lifting.targets import LiftPlan
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
-from barsight.yard.map_lookup import lookup_heights, nearest_cells
+from barsight.yard.map_lookup import CellGrid, lookup_heights, nearest_cells
 from barsight.yard.placement.clearance import FacePlane, find_obstacle
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, DoubtKind, HeightMap, YardMap
@@ -73,18 +73,20 @@ def find_unseen(plan: LiftPlan, yard: YardMap, bundles: tuple[Bundle, ...]) -> U
         parts = unseen_places(lift, load, yard, plan.magnet)
         if not parts:
             continue
-        about = _about(yard, np.concatenate([part[0] for part in parts]), MARGIN_M)
+        about = CellGrid.of(_about(yard, np.concatenate([part[0] for part in parts]), MARGIN_M))
         near_m, longest_near_m = (_near(one, parts, travel.reach_m + MARGIN_M) for one in (body_m, longest_m))
-        counts = [_count_views(travel.cameras, near_m, about, part) for part in parts]
-        if min((count < SEEN_VIEWS).mean() for count in counts) < HIDDEN_RATIO:
+        in_view = [_are_in_view(travel.cameras, near_m, about, part, SEEN_VIEWS) for part in parts]
+        if 1 - max(seen.mean() for seen in in_view) < HIDDEN_RATIO:
             in_sight += lift.bundles
             continue
         middle_y_m = float(np.concatenate(parts, axis=1)[0, :, 1].mean())
         shown = np.zeros(shifts_m.size, np.bool_)
         for k in np.flatnonzero(np.abs(base_y_m + shifts_m - middle_y_m) < REACH_M):
             there = longest_near_m + shifts_m[k] * ACROSS
-            counts = [_count_views(travel.cameras, there, about, part) for part in parts]
-            shown[k] = min((count >= SHOWN_VIEWS).mean() for count in counts) >= SHOWN_RATIO
+            shown[k] = all(
+                _are_in_view(travel.cameras, there, about, part, SHOWN_VIEWS).mean() >= SHOWN_RATIO
+                for part in parts
+            )
         hidden.append(_Unseen(lift, shown))
     own_y_m = [float(np.median(body_m[numbers == one, 1])) for one in np.unique(numbers)]
     return UnseenPlaces(_choose(hidden, shifts_m, base_y_m, own_y_m), tuple(dict.fromkeys(in_sight)))
@@ -123,12 +125,14 @@ def _from_ground(yard: YardMap, places: Float64, top_z_m: float) -> Float64:
     ])  # fmt: skip
 
 
-def _count_views(cameras: Cameras, body_m: Float64, about: HeightMap, part: Float64) -> Int64:
-    """Count the views of places (2, N, 3): those of the ground or of what may stand there, whichever are
-    fewer. The ground beneath a high thing may be seen from the side, where the picture cuts that off.
+def _are_in_view(cameras: Cameras, body_m: Float64, about: CellGrid, part: Float64, min_views: int) -> Bool:
+    """Check for places (2, N, 3) whether min_views views show the ground and also what may stand there; (N,).
+    The ground beneath a high thing may be seen from the side, where the picture cuts that off.
     """
-    ground, top = (cameras.count_views(body_m, about, level) for level in part)
-    return np.minimum(ground, top)
+    found: Bool = np.ones(part.shape[1], np.bool_)
+    for level in part:
+        found[found] = cameras.count_views(body_m, about, level[found], min_views) == min_views
+    return found
 
 
 def _measured_places(travel: Travel) -> Float64:

@@ -11,7 +11,6 @@ from barsight.core.arrays import Float64, Int64, kernel
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedCamera
 from barsight.yard.map_lookup import CellGrid, is_blocked
-from barsight.yard.types import HeightMap
 
 OVER_LINE_M = 0.02
 """Minimum height (m) over a line of sight of a surface that blocks it: the map's own error."""
@@ -64,22 +63,28 @@ class Cameras:
             for name in ("eyes_m", "axes", "bounds")
         )
 
-    def count_views(self, body_m: Float64, heights: HeightMap, places_m: Float64) -> Int64:
-        """Count the views (N,) that show places (N, 3): both cameras have it in their picture, and no surface
-        of the map is in the way. body_m: (F, 3) the body's places.
+    def count_views(self, body_m: Float64, grid: CellGrid, places_m: Float64, enough: int) -> Int64:
+        """Count the views (N,) that show places (N, 3), up to `enough`: both cameras have a place in their
+        pictures, and no surface of the map is in the way. body_m: (F, 3) the body's places.
         """
         eyes = np.ascontiguousarray(body_m[:, None] + self.eyes_m)
         axes, places = (np.ascontiguousarray(one, np.float64) for one in (self.axes, places_m))
-        return _count_views(CellGrid.of(heights), places, eyes, axes, self.bounds)
+        return _count_views(grid, places, eyes, axes, self.bounds, enough)
 
 
 @kernel()
-def _count_views(grid: CellGrid, places: Float64, eyes: Float64, axes: Float64, bounds: Float64) -> Int64:
-    """Count the views (N,) of places (N, 3) from eyes (F, 2, 3). axes, bounds: see `Cameras`."""
+def _count_views(
+    grid: CellGrid, places: Float64, eyes: Float64, axes: Float64, bounds: Float64, enough: int
+) -> Int64:
+    """Count the views (N,) of places (N, 3) from eyes (F, 2, 3), up to `enough`. axes, bounds: as in
+    `Cameras`.
+    """
     found = np.zeros(len(places), np.int64)
     for n in range(len(places)):
         place = (places[n, 0], places[n, 1], places[n, 2])
         for f in range(len(eyes)):
+            if found[n] == enough:
+                break
             found[n] += (
                 _is_pictured(place, eyes[f, 0], axes, bounds[0])
                 and _is_pictured(place, eyes[f, 1], axes, bounds[1])
