@@ -32,7 +32,7 @@ from barsight.simulation.worlds.packing import tag
 from barsight.simulation.worlds.solids import SolidYard, cylinder
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet.contact import rest_magnet
+from barsight.yard.magnet.contact import FaceHeights
 from barsight.yard.magnet.description import example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import hold_load
@@ -107,11 +107,12 @@ def test_faces_on_a_label_pull_and_touch_no_less_than_is_told(
     load = (record(laid(0.0), bar_diameter_m=diameter_m, bars=None),)
     for off_m in (-0.03, 0.0, 0.012):
         place = Placement(off_m, 0.0, 0.0)
-        bare = rest_magnet(scene.heights, place, magnet, settings.contact_gap_m)
-        assert bare is not None
+        faces = FaceHeights.of(scene.heights, place, magnet)
+        assert faces is not None
+        bare = faces.rest(magnet, settings.contact_gap_m)
         (label,) = find_labels(place, scene.heights, magnet, FacePlane.of(bare))
         told = []
-        for contact in rests_on_label(label, place, scene.heights, magnet, settings):
+        for contact in rests_on_label(label, place, faces, bare, magnet, settings):
             held = hold_load(contact, magnet, load, settings.strap_m)
             (share,) = (
                 c for c in face_checks(held, 1.0, magnet, load, settings) if c.what.startswith("share")

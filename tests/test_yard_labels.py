@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barsight.yard.lifting.assessment import Hold
-from barsight.yard.magnet.contact import rest_magnet
+from barsight.core.records.heights import HeightSource
+from barsight.yard.lift_settings import UPPER
+from barsight.yard.lifting.hold import Hold
+from barsight.yard.magnet.contact import FaceHeights, rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import weakest_bundle
@@ -94,6 +96,27 @@ def test_thin_bars_are_held_on_one_label_and_the_pull_on_it_is_told(
     assert bool(codes(lift)) == bool(told) and all(told in veto.reason for veto in lift.vetoes)
     if labels_m and not told:
         assert lift.contact.pull_low_n < 0.97 * bare.contact.pull_low_n and lift.safety < bare.safety
+        assert lift.contact.contact_share < bare.contact.contact_share
+    if not told:
+        for name in ("centre_z_m", "roll_rad", "pitch_rad", "sigma_m"):
+            assert getattr(lift.contact, name) == getattr(bare.contact, name)
+        (pull,) = (check for check in lift.checks if check.what == "pull on the load")
+        assert pull.value is not None and pull.sigma is not None
+        assert pull.value - UPPER * pull.sigma == pytest.approx(lift.contact.pull_low_n)
+
+
+def test_a_label_whose_heights_were_filled_in_is_one_of_unknown_height() -> None:
+    """A filled height 30 mm below the faces' plane would have it lie on a flank."""
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    at = np.ix_(np.abs(heights.y_m - MAGNET.poles[0].along_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
+    gray, z_m, source = np.full(heights.shape, 90, np.uint8), heights.z_m.copy(), heights.source.copy()
+    gray[at], source[at] = 250, HeightSource.FILLED
+    z_m[at] -= 0.03
+    faces = plane(PLACE, heights)
+    for code, found in ((HeightSource.FILLED, 1), (HeightSource.UNKNOWN, 1), (source[0, 0], 0)):
+        source[at] = code
+        shown = replace(heights, gray=gray, z_m=z_m, source=source)
+        assert len(find_labels(PLACE, shown, MAGNET, faces)) == found
 
 
 def test_a_lift_is_no_safer_than_on_any_part_of_a_label() -> None:
@@ -105,9 +128,12 @@ def test_a_lift_is_no_safer_than_on_any_part_of_a_label() -> None:
     heights = replace(heights, gray=gray)
     lift = judged([one], load, PLACE, heights=heights)
     (label,) = find_labels(PLACE, heights, MAGNET, plane(PLACE, heights))
+    faces = FaceHeights.of(heights, PLACE, MAGNET)
+    assert faces is not None
+    bare = faces.rest(MAGNET, SETTINGS.contact_gap_m)
     held = [
         Hold.of(contact, PLACE, MAGNET, load, lift.needed_n, SETTINGS)
-        for contact in rests_on_label(label, PLACE, heights, MAGNET, SETTINGS)
+        for contact in rests_on_label(label, PLACE, faces, bare, MAGNET, SETTINGS)
     ]
     least = min(hold.weakest.ratio for hold in held if hold.weakest)
     assert codes(lift) == set() and lift.contact is not None and lift.safety <= least
@@ -140,7 +166,10 @@ def test_a_plate_is_at_least_as_thick_as_the_map_shows() -> None:
     highest = []
     for shown in (flat, replace(flat, z_m=z_m)):
         (label,) = find_labels(PLACE, shown, MAGNET, plane(PLACE, shown))
-        rests = rests_on_label(label, PLACE, shown, MAGNET, SETTINGS)
+        faces = FaceHeights.of(shown, PLACE, MAGNET)
+        assert faces is not None
+        bare = faces.rest(MAGNET, SETTINGS.contact_gap_m)
+        rests = rests_on_label(label, PLACE, faces, bare, MAGNET, SETTINGS)
         highest.append(max(contact.centre_z_m for contact in rests))
     assert highest[1] - highest[0] > 0.001
 

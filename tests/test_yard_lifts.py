@@ -26,8 +26,7 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting import targets
-from barsight.yard.lifting.assessment import assess_placement
-from barsight.yard.lifting.lift import Lift
+from barsight.yard.lifting.assessment import Assessed, assess_place
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -716,11 +715,11 @@ def test_a_load_that_stands_badly_is_assessed_at_its_middle_alone(monkeypatch: p
     """No other place of the magnet changes how the pile carries it."""
     asked = list[Placement]()
 
-    def assess(place: Placement, *args: Any, **named: Any) -> Lift:
+    def assess(place: Placement, *args: Any) -> Assessed:
         asked.append(place)
-        return assess_placement(place, *args, **named)
+        return assess_place(place, *args)
 
-    monkeypatch.setattr(targets, "assess_placement", assess)
+    monkeypatch.setattr(targets, "assess_place", assess)
     stock, bundles = stack(0.15)
     plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
     assert "no-support" in codes(plan.refused[0]) and len(asked) == len(plan.refused) == 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.records.heights import HeightSource
-from barsight.yard.lifting.assessment import assess_placement
+from barsight.yard.lifting.assessment import assess_place
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement, count_gripped
 from barsight.yard.magnet.partings import without_parted
@@ -110,7 +110,7 @@ def test_a_hardly_known_neighbour_whose_flank_is_seen_isnt_taken(way: str) -> No
     stock = [laid(0.3), laid(0.56)]
     heights = hidden(map_of(stock), 0.41 if way == "shown" else 0.4, 0.45 if way == "shown" else 0.49)
     two = tuple(record(one, k, sigma=replace(SIGMA, lateral_m=0.03)) for k, one in enumerate(stock))
-    lift = assess_placement(OVER, yard_of(heights, two), MAGNET, SETTINGS, search=False)
+    lift = assess_place(OVER, yard_of(heights, two), MAGNET, SETTINGS).lift
     assert ("count-uncertain" in codes(lift)) == (way == "hidden")
 
 

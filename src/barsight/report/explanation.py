@@ -168,7 +168,7 @@ def draw_place(
     sigma_mm = next(check["sigma"] for check in record["checks"] if check["what"] == HIGHEST_OBJECT)
     load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
     faces = FacePlane(
-        target["z_m"] - over_map_m(load, settings.strap_m), math.radians(record["pitch_deg"]),
+        target["z_m"] - over_map_m(load, settings.strap_m)[0], math.radians(record["pitch_deg"]),
         math.radians(record["roll_deg"]), sigma_mm / 1e3,
     )  # fmt: skip
     picture = _paint(part, place, faces, long, wide)

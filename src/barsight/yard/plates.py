@@ -71,15 +71,18 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
 
 
 def plate_masks(
-    gray: Float32, z_m: Float32, size_m: tuple[float, float], white_level: float = WHITE_LEVEL
-) -> Iterator[Bool]:
+    gray: Float32, z_m: Float32, size_m: tuple[float, float], white_level: float = WHITE_LEVEL, *,
+    unknown_rise_m: float = math.inf,
+) -> Iterator[Bool]:  # fmt: skip
     """Yield a mask (V, U) of each plate of about size_m, in either direction; one plate may occur twice.
 
     gray: levels (V, U) at places STEP_M apart, V along the bars; 0 where nothing was seen. z_m: heights.
-    white_level: minimum level of the paper around a code.
+    white_level: minimum level of the paper around a code. unknown_rise_m: what a plate counts as rising where
+    its height, or that beside it, isn't known.
     """
     for cells in (*_plates(gray, size_m), *_codes(gray, size_m, white_level)):
-        if abs(_rise(cells, z_m)) <= MAX_RISE_M:
+        rise = _rise(cells, z_m)
+        if abs(unknown_rise_m if math.isnan(rise) else rise) <= MAX_RISE_M:
             yield cells
 
 
@@ -147,7 +150,7 @@ def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
 
 
 def _rise(cells: Bool, z_m: Float32) -> float:
-    """Compute how far cells rise over the higher surface before or behind them; inf if unknown."""
+    """Compute how far cells rise over the higher surface before or behind them; NaN if unknown."""
     i, j = np.nonzero(cells)
     beside = []
     for way in (-1, 1):
@@ -157,5 +160,5 @@ def _rise(cells: Bool, z_m: Float32) -> float:
         beside += [float(np.median(level[np.isfinite(level)]))] if np.isfinite(level).any() else []
     own = z_m[i, j]
     if not beside or not np.isfinite(own).any():
-        return np.inf
+        return math.nan
     return float(np.median(own[np.isfinite(own)])) - max(beside)

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from barsight.yard.lift_settings import UPPER
+
 VETOES = {
     "no-magnet": "No magnet is described; an assumed one forbids every lift.",
     "map-too-old": "The place was last seen longer ago than the settings allow, or at an unknown time.",
@@ -94,6 +96,19 @@ class Check:
 def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
     """List the vetoes: one for every check that isn't passed."""
     return tuple(Veto(check.code, check.reason) for check in checks if check.result != "passed")
+
+
+def nearest_to_limit(checks: Iterable[Check]) -> Check:
+    """Take, of one check made in several ways, the one that failed, else the one nearest to its limit."""
+
+    def margin(check: Check) -> float:
+        if check.result != "passed":
+            return -math.inf
+        if check.value is None or check.bound is None:
+            return math.inf
+        return abs(check.bound - check.value) - UPPER * (check.sigma or 0.0)
+
+    return min(checks, key=margin)
 
 
 def check_max(

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.yard.lift_settings import UPPER, LiftSettings
+from barsight.yard.lifting.hold import SEVERAL, Hold, Task, hold_on_labels, label_check
 from barsight.yard.lifting.lift import Lift, LiftScene
 from barsight.yard.lifting.travel_accuracy import crane_checks, target_covariance
 from barsight.yard.lifting.validity import age_checks, disturbed_checks, validity
-from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
+from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, FaceHeights
 from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.magnet.footprint import (
     BEYOND_OPEN_END_M,
@@ -22,14 +23,6 @@ from barsight.yard.magnet.footprint import (
     Rectangles,
     count_gripped,
 )
-from barsight.yard.magnet.holding import (
-    WeakestPole,
-    hold_load,
-    pried_ratio,
-    share_checks,
-    weakest_bundle,
-    weakest_pole,
-)
 from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.magnet.seen_edges import seen_clearances
@@ -37,18 +30,15 @@ from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.placement.checks import (
     area_checks,
     count_checks,
-    face_checks,
     load_checks,
     probability_check,
     unknown_check,
 )
 from barsight.yard.placement.clearance import (
     FacePlane,
-    clearance_checks,
     find_obstacle,
 )
-from barsight.yard.placement.labels import SeenLabel, find_labels, rests_on_label
-from barsight.yard.placement.load import leaning_checks, resting_checks
+from barsight.yard.placement.labels import SeenLabel, find_labels
 from barsight.yard.placement.thin_bars import (
     beside_checks,
     edge_checks,
@@ -63,140 +53,103 @@ from barsight.yard.weight import Mass, bundle_mass, load_centre
 
 SCALES = (1.0, 1.5, 2.5)
 """Multiples of the crane's tolerance that are tried as the box within which a lift remains as checked."""
-SEVERAL = "several labels or other bright plates may be under the faces"
 ON_LABEL = "if the faces rest on a label or another bright plate"
 
 
 @dataclass(frozen=True, eq=False)
-class Hold:
-    """Hold of a load by resting faces: their contact with its pull, the weakest pole, `pried_ratio` and
-    `weakest_bundle`.
+class Assessed:
+    """A placement whose tolerance isn't determined yet. near: the bundles about it; held: those taken;
+    labels: those under the faces, None where something else forbids the lift.
     """
 
-    contact: Contact
-    weakest: WeakestPole | None
-    pried: float
-    worst: float
+    lift: Lift
+    near: BundleTable
+    held: Grip | None = None
+    labels: tuple[SeenLabel, ...] | None = None
 
-    @classmethod
-    def of(
-        cls, contact: Contact, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
-        settings: LiftSettings,
-    ) -> Hold:  # fmt: skip
-        """Compute it from a contact without a pull."""
-        contact = hold_load(contact, magnet, load, settings.strap_m)
-        return cls(
-            contact, weakest_pole(contact, needed_n, magnet, place, load),
-            pried_ratio(contact, needed_n, magnet, place, load),
-            weakest_bundle(contact, magnet, place, load, settings.strap_m),
+    def within_tolerance(self, yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
+        """Determine the tolerance of a lift without a veto, which may itself be a veto."""
+        lift = self.lift
+        if self.held is None or lift.contact is None or lift.vetoes:
+            return replace(lift, safety=0.0)
+        load = tuple(self.near.bundles[k] for k in self.held.gripped)
+        task = Task(lift.place, yard.heights, magnet, load, lift.needed_n, settings)
+        scale, end = _tolerance(task, self, lift.contact)
+        reason = f"elsewhere within the crane's tolerance: {end}"
+        what = "size of the box in which all checks pass, relative to the crane's tolerance"
+        return replace(
+            lift, tolerance=_scaled(magnet.tolerance, scale), safety=min(lift.safety, scale),
+            checks=(*lift.checks, check_min("narrow-tolerance", what, scale, SCALES[0], "", reason)),
         )  # fmt: skip
 
-    def weaker(self, other: Hold) -> Hold:
-        """Take the contact of the smaller pull, and the minimum of each ratio."""
-        contact = min(self.contact, other.contact, key=lambda either: either.pull_low_n)
-        poles = [one.weakest for one in (self, other) if one.weakest]
-        weakest = min(poles, key=lambda pole: pole.ratio, default=None)
-        return Hold(contact, weakest, min(self.pried, other.pried), min(self.worst, other.worst))
 
-    def checks(
-        self, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
-        settings: LiftSettings,
-    ) -> list[Check]:  # fmt: skip
-        """Check how the faces lie and pull, and that they rest on the load."""
-        return [
-            *face_checks(self.contact, needed_n, magnet, load, settings),
-            *share_checks(self.weakest, self.pried, self.worst),
-            *resting_checks(place, magnet, self.contact, load, settings.strap_m),
-        ]
+def assess_placement(place: Placement, yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
+    """Assess a placement, and the tolerance within which it holds."""
+    return assess_place(place, yard, magnet, settings).within_tolerance(yard, magnet, settings)
 
 
-def assess_placement(
-    place: Placement, yard: LiftScene, magnet: Magnet, settings: LiftSettings, *, search: bool = True
-) -> Lift:
-    """Assess a placement. Without `search`, the tolerance isn't determined, and can't be a veto."""
+def assess_place(place: Placement, yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Assessed:
+    """Assess a placement without its tolerance."""
     near = nearby_bundles(yard.table, place, magnet)
-    contact = rest_magnet(yard.heights, place, magnet, settings.contact_gap_m)
-    if contact is None:
-        return _unseen_lift(place)
+    faces = FaceHeights.of(yard.heights, place, magnet)
+    if faces is None:
+        return Assessed(_unseen_lift(place), near)
+    contact = faces.rest(magnet, settings.contact_gap_m)
     held = _grip(place, yard.heights, magnet, magnet.tolerance, near, contact)
     load = tuple(near.bundles[k] for k in held.gripped)
     valid = validity(yard.travel, place, magnet, load, yard.heights, settings) if yard.travel else None
     mass = _load_mass(load)
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
-    hold = Hold.of(contact, place, magnet, load, needed, settings)
+    task = Task(place, yard.heights, magnet, load, needed, settings)
+    hold = task.hold(contact)
     contact = hold.contact
     away = np.array([place.x_m, place.y_m]) - load_centre(load)
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
-    checks = [
+    before = [
         *crane_checks(yard.travel, place, magnet, settings),
         *(age_checks(valid.from_ns if valid else None, yard.now_ns, settings) if yard.travel else ()),
         *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
-        *hold.checks(place, magnet, load, needed, settings),
-        *clearance_checks(place, yard.heights, magnet, contact, load, settings.stanchions),
-        *leaning_checks(place, magnet, contact, load, settings.strap_m),
+    ]
+    resting = [*task.checks(hold), *task.clearance(contact)]
+    after = [
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
-    if not vetoes_of(checks):
-        hold, on_label = _on_label(hold, place, yard, magnet, load, needed, settings)
-        checks += on_label
-        pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
-        checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
-        if has_pictures(yard.heights, pixel_m):
-            low_z_m = FacePlane.of(contact).centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
-            others = [b for b in near.bundles if b not in load and may_reach(b, place, magnet, low_z_m)]
-            checks += edge_checks(others)
-            checks += beside_checks(place, magnet, tuple((b, yard.thin_lines(b)) for b in others))
-    scale = 0.0
-    if search and not vetoes_of(checks):
-        scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)
-        reason = f"elsewhere within the crane's tolerance: {end}"
-        what = "size of the box in which all checks pass, relative to the crane's tolerance"
-        checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    return Lift(
+    labels = None
+    if not vetoes_of((*before, *resting, *after)):
+        labels = find_labels(place, yard.heights, magnet, FacePlane.of(contact))
+        hold, resting, reason = hold_on_labels(hold, resting, task, faces, labels)
+        if yard.heights.gray is not None:
+            after.append(label_check(place, labels, reason))
+        after += _thin_checks(task, yard, near, contact)
+    lift = Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         hold.contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
-        _scaled(magnet.tolerance, scale),
-        _safety(hold, needed, mass, magnet, scale if search else math.inf),
-        tuple(checks), valid, target_covariance(
-            place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel,
-            magnet.offset,
+        _scaled(magnet.tolerance, 0.0), _safety(hold, needed, mass, magnet),
+        (*before, *resting, *after), valid,
+        target_covariance(
+            place, load, math.hypot(contact.gap_sigma_m, contact.over_map_sigma_m),
+            _map_sigma(yard.heights, place, magnet), yard.travel, magnet.offset,
         ),
     )  # fmt: skip
+    return Assessed(lift, near, held, labels)
 
 
-def _on_label(
-    hold: Hold, place: Placement, yard: LiftScene, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
-    settings: LiftSettings,
-) -> tuple[Hold, list[Check]]:  # fmt: skip
-    """Check that the faces hold the load wherever a label under one may bear them; and the weakest hold."""
-    if yard.heights.gray is None:
-        return hold, []
-    labels = find_labels(place, yard.heights, magnet, FacePlane.of(hold.contact))
-    reason = SEVERAL if len(labels) > 1 else ""
-    rests = (rests_on_label(label, place, yard.heights, magnet, settings) for label in labels[:1])
-    for contact in itertools.chain.from_iterable(() if reason else rests):
-        one = Hold.of(contact, place, magnet, load, needed_n, settings)
-        failed = vetoes_of([
-            *one.checks(place, magnet, load, needed_n, settings),
-            *clearance_checks(place, yard.heights, magnet, one.contact, load, settings.stanchions),
-            *leaning_checks(place, magnet, one.contact, load, settings.strap_m),
-        ])  # fmt: skip
-        if failed:
-            reason = failed[0].reason
-            break
-        hold = hold.weaker(one)
-    if reason:
-        along, across = labels[0].place_under(place)
-        reason = (
-            f"a label or another bright plate is under a face, {along:+.2f} m along and {across:+.2f} m "
-            f"across the beam, and may hold the faces off the bars: {reason}"
-        )
-    return hold, [check_true("gap", "a label under a face leaves the load held", not reason, reason)]
+def _thin_checks(task: Task, yard: LiftScene, near: BundleTable, contact: Contact) -> list[Check]:
+    """Check that no thin bar lies across the load, or across a neighbour and towards the magnet."""
+    place, magnet, load = task.place, task.magnet, task.load
+    pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
+    checks = thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, task.settings)
+    if has_pictures(yard.heights, pixel_m):
+        low_z_m = FacePlane.of(contact).centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
+        others = [b for b in near.bundles if b not in load and may_reach(b, place, magnet, low_z_m)]
+        checks += edge_checks(others)
+        checks += beside_checks(place, magnet, tuple((b, yard.thin_lines(b)) for b in others))
+    return checks
 
 
 def _grip(
@@ -219,16 +172,16 @@ def _unseen_lift(place: Placement) -> Lift:
     return Lift(place, (), 0, 0.0, (), None, Mass(nan, nan), nan, nan, nan, nan, nothing, 0.0, (unseen,))
 
 
-def _safety(hold: Hold, needed_n: float, mass: Mass, magnet: Magnet, scale: float) -> float:
-    """Compute a lift's safety: the minimum of pull over needed pull, weakest pole's pull over its share, what
-    the load pries off, the worst bundle, capacity over load, and tolerance over the crane's, `scale`.
+def _safety(hold: Hold, needed_n: float, mass: Mass, magnet: Magnet) -> float:
+    """Compute a lift's safety without that of its tolerance: the minimum of pull over needed pull, weakest
+    pole's pull over its share, what the load pries off, the worst bundle, and capacity over load.
     """
     capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     ratios = (
         hold.contact.pull_low_n / needed_n if needed_n > 0 else 0.0,
         hold.weakest.ratio if hold.weakest else 0.0,
         capacity_kg / mass.upper_kg if mass.upper_kg > 0 else 0.0,
-        hold.pried, hold.worst, scale,
+        hold.pried, hold.worst,
     )  # fmt: skip
     return float(np.nan_to_num(np.min(ratios)))
 
@@ -278,30 +231,29 @@ def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tup
     return max(beyond, key=lambda way: way[0] + UPPER * way[1], default=(math.nan, math.nan))
 
 
-def _tolerance(
-    place: Placement, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip, needed_n: float,
-    contact: Contact, settings: LiftSettings,
-) -> tuple[float, str]:  # fmt: skip
+def _tolerance(task: Task, assessed: Assessed, contact: Contact) -> tuple[float, str]:
     """Find the largest of SCALES times the crane's tolerance within which the lift remains as checked, and
-    the reason why no larger one does.
+    the reason why no larger one does. contact: where the faces are bare.
     """
-    found, load = 0.0, tuple(near.bundles[k] for k in held.gripped)
+    place, heights, magnet = task.place, task.heights, task.magnet
+    found, held, labels = 0.0, assessed.held, assessed.labels or ()
+    assert held is not None
     for scale in SCALES:
         box = _scaled(magnet.tolerance, scale)
-        sure = _grip(place, yard.heights, magnet, box, near, contact).probability
-        unsure = vetoes_of([probability_check(sure, len(held.gripped), settings)])
-        if unsure:
-            return found, unsure[0].reason
-        wider = replace(magnet, tolerance=box)
-        labels = find_labels(place, yard.heights, wider, FacePlane.of(contact))
-        if len(labels) > 1:
-            return found, SEVERAL
-        changed = _change(place, box, yard, magnet, near, held, needed_n, settings, labels)
+        if scale > SCALES[0]:
+            # The crane's own tolerance is that of the checks that passed already.
+            sure = _grip(place, heights, magnet, box, assessed.near, contact).probability
+            for veto in vetoes_of([probability_check(sure, len(held.gripped), task.settings)]):
+                return found, veto.reason
+            wider = replace(task, magnet=replace(magnet, tolerance=box))
+            labels = find_labels(place, heights, wider.magnet, FacePlane.of(contact))
+            if len(labels) > 1:
+                return found, SEVERAL
+            for veto in vetoes_of(wider.clearance(contact)):
+                return found, veto.reason
+        changed = _change(box, task, assessed, labels)
         if changed:
             return found, changed
-        clear = clearance_checks(place, yard.heights, wider, contact, load, settings.stanchions)
-        for veto in vetoes_of(clear):
-            return found, veto.reason
         found = scale
     return found, ""
 
@@ -313,34 +265,33 @@ def _scaled(tolerance: Tolerance, scale: float) -> Tolerance:
     )
 
 
-def _change(
-    place: Placement, box: Tolerance, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip,
-    needed_n: float, settings: LiftSettings, labels: tuple[SeenLabel, ...],
-) -> str:  # fmt: skip
-    """Find what changes at a corner of the box where the faces come to rest there, on labels or not; empty if
-    nothing does.
+def _change(box: Tolerance, task: Task, assessed: Assessed, labels: tuple[SeenLabel, ...]) -> str:
+    """Find what changes at a corner of the box where the faces come to rest there, on labels or not; empty
+    if nothing does.
     """
-    load = tuple(near.bundles[k] for k in held.gripped)
-    exact = replace(magnet, tolerance=Tolerance(0.0, 0.0, 0.0))
+    heights, load, settings, held = task.heights, task.load, task.settings, assessed.held
+    exact = replace(task.magnet, tolerance=Tolerance(0.0, 0.0, 0.0))
     for dx, dy, dyaw in itertools.product((-1, 1), repeat=3):
+        at = task.place
         moved = replace(
-            place, x_m=place.x_m + dx * box.x_m, y_m=place.y_m + dy * box.y_m,
-            yaw_rad=place.yaw_rad + dyaw * math.radians(box.yaw_deg),
+            at, x_m=at.x_m + dx * box.x_m, y_m=at.y_m + dy * box.y_m,
+            yaw_rad=at.yaw_rad + dyaw * math.radians(box.yaw_deg),
         )  # fmt: skip
-        bare = rest_magnet(yard.heights, moved, magnet, settings.contact_gap_m)
-        if bare is None:
+        faces = FaceHeights.of(heights, moved, exact)
+        if faces is None:
             return "nothing is known under the magnet"
-        rests = (rests_on_label(label, moved, yard.heights, magnet, settings) for label in labels)
-        for contact in itertools.chain((bare,), *rests):
-            hold = Hold.of(contact, moved, magnet, load, needed_n, settings)
-            held_checks = hold.checks(moved, magnet, load, needed_n, settings)
-            for veto in vetoes_of([unknown_check(contact, settings), *held_checks]):
+        there = replace(task, place=moved)
+        bare = faces.rest(exact, settings.contact_gap_m)
+        rests = list(there.rests(faces, bare, labels))
+        for contact in (bare, *rests):
+            checks = there.hold(contact).checks(moved, task.magnet, load, task.needed_n, settings)
+            for veto in vetoes_of([unknown_check(contact, settings), *checks]):
                 return veto.reason if contact is bare else f"{ON_LABEL}: {veto.reason}"
-            # The whole box was checked against the limits with their sigmas; only the faces' rest is new.
-            obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
-            if obstacle is not None:
-                return obstacle.reason
-        there = _grip(moved, yard.heights, magnet, exact.tolerance, near, bare)
-        if there.gripped != held.gripped:
-            return f"the magnet would take {len(there.gripped)} bundles"
+        # The whole box was checked against the limits with their sigmas; only the faces' rest is new.
+        obstacle = find_obstacle(moved, heights, exact, FacePlane.of(bare, rests), load, careful=False)
+        if obstacle is not None:
+            return obstacle.reason
+        gripped = _grip(moved, heights, exact, exact.tolerance, assessed.near, bare).gripped
+        if held is None or gripped != held.gripped:
+            return f"the magnet would take {len(gripped)} bundles"
     return ""

@@ -16,7 +16,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.yard.axes import axes_of, high_side, turn_between
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import assess_placement
+from barsight.yard.lifting.assessment import Assessed, assess_place
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.lift import Lift, LiftScene, UnseenPlaces
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
@@ -258,52 +258,52 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
 def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
     """Choose the placement with the fewest vetoes, then the safest; the middle if the load is vetoed."""
 
-    def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
+    def tried(offsets: Iterable[tuple[float, float]]) -> list[Assessed]:
         places = (_place(group, magnet, along, across) for along, across in offsets)
-        return [assess_placement(place, yard, magnet, settings, search=False) for place in places]
+        return [assess_place(place, yard, magnet, settings) for place in places]
 
     limit = magnet.limits.offset_across_m
     quick = tried([(0.0, 0.0)])
-    if set(quick[0].bundles) == {bundle.id for bundle in group} and _forbidden_anywhere(quick):
-        return quick[0]
+    if set(quick[0].lift.bundles) == {bundle.id for bundle in group} and _forbidden_anywhere(quick):
+        return quick[0].lift
     quick += tried((0.0, across) for across in ACROSS_M if 0 < abs(across) < limit)
-    quick.sort(key=_best_first)
+    quick.sort(key=lambda one: _best_first(one.lift))
     sound = _sound(quick, yard, magnet, settings)
     if _forbidden_anywhere(quick) or (sound is not None and not sound.vetoes):
-        return sound or quick[0]
-    middle = _offset_across(group, quick[0].place)
+        return sound or quick[0].lift
+    middle = _offset_across(group, quick[0].lift.place)
     found = [] if sound is None else [sound]
     between = [(0.0, across) for across in BETWEEN_M if sound is not None and abs(across) < limit]
     for lengths, others in ((ALONG_M, between), (BETWEEN_ALONG_M, [])):
         beside = [(along, across) for along in lengths for across in dict.fromkeys((0.0, middle))]
-        more = sorted(tried([*others, *beside]), key=_best_first)
+        more = sorted(tried([*others, *beside]), key=lambda one: _best_first(one.lift))
         quick += more
         best = _sound(more, yard, magnet, settings)
         found += [] if best is None else [best]
         if (best is not None and not best.vetoes) or _shared_codes(quick):
             break
-    return min(found or quick, key=_best_first)
+    return min(found or (one.lift for one in quick), key=_best_first)
 
 
-def _forbidden_anywhere(lifts: list[Lift]) -> bool:
+def _forbidden_anywhere(quick: list[Assessed]) -> bool:
     """Check whether all lifts have the same veto of the load itself."""
-    return bool(ANYWHERE & _shared_codes(lifts))
+    return bool(ANYWHERE & _shared_codes(quick))
 
 
-def _shared_codes(lifts: list[Lift]) -> set[str]:
+def _shared_codes(quick: list[Assessed]) -> set[str]:
     """Return the codes of the vetoes that all lifts have."""
-    return set.intersection(*({veto.code for veto in lift.vetoes} for lift in lifts))
+    return set.intersection(*({veto.code for veto in one.lift.vetoes} for one in quick))
 
 
-def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
+def _sound(quick: list[Assessed], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
     """Find the first lift that also holds within the crane's tolerance; otherwise the best, None without any.
 
     All are tried: if only some were, noise would decide which ones, and so whether a lift is offered.
     """
-    whole = []
-    for lift in quick:
-        if not lift.vetoes:
-            whole.append(assess_placement(lift.place, yard, magnet, settings))
+    whole = list[Lift]()
+    for one in quick:
+        if not one.lift.vetoes:
+            whole.append(one.within_tolerance(yard, magnet, settings))
             if not whole[-1].vetoes:
                 return whole[-1]
     return min(whole, key=_best_first, default=None)

@@ -68,10 +68,11 @@ class Contact:
     rest where the suspension stops their lean, otherwise 0. sigma_m: of the plane's height, including the
     error that the whole map shares; gap_sigma_m: of the height over the steel. touch_gap_m: maximum gap at
     which a place of a face touches. over_map_m: how much higher than on the map the faces lie on a known
-    load; map_z_m: (P,) their height on the map. pull_n, pull_low_n: the pull, and its lower bound (95 %).
+    load, with its sigma; map_z_m: (P,) their height on the map. pull_n, pull_low_n: the pull, and its lower
+    bound (95 %).
     widest_gap_m: the largest of the poles' smallest gaps. contact_share: of all faces; unknown_share: the
     worst pole's. plate_m: (N, 2) places, along and across, where the faces touch a plate on the steel
-    (`rest_magnet`).
+    (`FaceHeights.rest`).
     """
 
     centre_z_m: float
@@ -85,6 +86,7 @@ class Contact:
     poles: tuple[PoleContact, ...]
     plate_m: Float64 = field(default_factory=lambda: np.empty((0, 2)))
     over_map_m: float = 0.0
+    over_map_sigma_m: float = 0.0
 
     @property
     def map_z_m(self) -> Float64:
@@ -117,52 +119,73 @@ class Contact:
         return max(pole.min_gap_m for pole in self.poles)
 
 
-def rest_magnet(
-    heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float, plate: Float64 = NO_PLATE
-) -> Contact | None:
-    """Set the magnet down on the map; None where nothing at all is known under it.
-
-    contact_gap_m: maximum gap between a face and steel on which it lies. plate: (N, 3) corners of a plate
-    under a face that the map doesn't show: along, across and height, m.
+@dataclass(frozen=True, eq=False)
+class FaceHeights:
+    """Heights under all faces, by which they rest. shape: (P, 2) columns and parts of each pole; points:
+    (N, COLUMNS) of `profiles`, straightened. noise_m: that remains in them. unknown: (P,) `unknown_share`.
     """
-    poles = magnet.pole_table
-    shape, points = profiles(heights, place, poles)
-    seen = np.isfinite(points[:, Z])
-    if seen.sum() < 3:
-        return None
-    noise = straighten_heights(points)
-    most = np.tan(np.radians(magnet.limits.roll_deg))
-    v, u, z = (np.append(points[seen, k], plate[:, n]) for n, k in enumerate((V, U, Z)))
-    height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
-    touch_gap = contact_gap_m + noise
-    table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
-    touches, sigma = height + roll * u + pitch * v - z <= touch_gap, points[seen, SIGMA]
-    on_map, on_plate = np.split(touches, [sigma.size])
-    # Faces that rest on a plate alone may touch none of the map.
-    touched = sigma[on_map] if on_map.any() else sigma
-    faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
-    found, first = [], 0
-    for number, (columns, parts) in enumerate(shape):
-        last = first + columns * parts
-        mean, least, share = (float(figure) for figure in table[number])
-        unseen = (1 - points[first:last, SEEN] / points[first:last, ALL]).reshape(columns, parts)
-        unknown = float(grey_opening(unseen, (HIDING_COLUMNS, 1), mode="nearest").mean())
-        gap_map = gaps[first:last].reshape(columns, parts)
-        face = float(faces[number])
-        found.append(PoleContact(mean, least, share, unknown, face, gap_map))
-        first = last
-    return Contact(
-        height,
-        faces,
-        math.atan(pitch),
-        math.atan(roll),
-        rests_off,
-        math.hypot(noise, float(np.median(touched))),
-        noise,
-        touch_gap,
-        tuple(found),
-        plate[on_plate, :2],
-    )
+
+    shape: list[tuple[int, int]]
+    points: Float64
+    noise_m: float
+    unknown: tuple[float, ...]
+
+    @classmethod
+    def of(cls, heights: HeightMap, place: Placement, magnet: Magnet) -> FaceHeights | None:
+        """Sample a map; None where nothing at all is known under the magnet."""
+        shape, points = profiles(heights, place, magnet.pole_table)
+        if np.isfinite(points[:, Z]).sum() < 3:
+            return None
+        noise, unknown, first = straighten_heights(points), [], 0
+        for columns, parts in shape:
+            own = points[first : first + columns * parts]
+            unseen = (1 - own[:, SEEN] / own[:, ALL]).reshape(columns, parts)
+            hiding = unseen.any() and grey_opening(unseen, (HIDING_COLUMNS, 1), mode="nearest").mean()
+            unknown.append(float(hiding))
+            first += columns * parts
+        return cls(shape, points, noise, tuple(unknown))
+
+    def rest(self, magnet: Magnet, contact_gap_m: float, plate: Float64 = NO_PLATE) -> Contact:
+        """Set the magnet down. contact_gap_m: maximum gap between a face and steel on which it lies. plate:
+        (N, 3) corners of a plate under a face that the map doesn't show: along, across and height, m.
+        """
+        points, noise, poles = self.points, self.noise_m, magnet.pole_table
+        seen = np.isfinite(points[:, Z])
+        most = np.tan(np.radians(magnet.limits.roll_deg))
+        v, u, z = (np.append(points[seen, k], plate[:, n]) for n, k in enumerate((V, U, Z)))
+        height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
+        touch_gap = contact_gap_m + noise
+        table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
+        touches, sigma = height + roll * u + pitch * v - z <= touch_gap, points[seen, SIGMA]
+        on_map, on_plate = np.split(touches, [sigma.size])
+        # Faces that rest on a plate alone may touch none of the map.
+        touched = sigma[on_map] if on_map.any() else sigma
+        faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
+        ends = np.cumsum([columns * parts for columns, parts in self.shape])
+        found = tuple(
+            PoleContact(float(mean), float(least), float(share), unknown, float(face), own.reshape(form))
+            for (mean, least, share), unknown, face, own, form in zip(
+                table, self.unknown, faces, np.split(gaps, ends[:-1]), self.shape, strict=True
+            )
+        )
+        return Contact(
+            height,
+            faces,
+            math.atan(pitch),
+            math.atan(roll),
+            rests_off,
+            math.hypot(noise, float(np.median(touched))),
+            noise,
+            touch_gap,
+            found,
+            plate[on_plate, :2],
+        )
+
+
+def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
+    """Set the magnet down on the map (`FaceHeights.rest`); None where nothing at all is known under it."""
+    faces = FaceHeights.of(heights, place, magnet)
+    return None if faces is None else faces.rest(magnet, contact_gap_m)
 
 
 @kernel()

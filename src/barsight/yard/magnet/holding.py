@@ -42,18 +42,23 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
     """
     if not load:
         return contact
-    higher, held = over_map_m(load, strap_m), _pulled(contact, magnet, load, strap_m)
+    higher, sigma, held = *over_map_m(load, strap_m), _pulled(contact, magnet, load, strap_m)
     return replace(
         held, centre_z_m=held.centre_z_m + higher, z_m=held.z_m + higher, over_map_m=higher,
+        over_map_sigma_m=sigma, sigma_m=math.hypot(held.sigma_m, sigma),
         poles=tuple(replace(own, z_m=own.z_m + higher) for own in held.poles),
     )  # fmt: skip
 
 
-def over_map_m(load: tuple[Bundle, ...], strap_m: float) -> float:
-    """Estimate how much higher (m) than a map shows faces lie on a load: by half of what may be cut off its
-    crests, and by a strap. Crests of bars of unknown diameter count as shown.
+def over_map_m(load: tuple[Bundle, ...], strap_m: float) -> tuple[float, float]:
+    """Estimate how much higher (m) than a map shows faces lie on a load, and the sigma: by half of what may
+    be cut off its crests, and by a strap; either may be missing. Crests of bars of unknown diameter count as
+    shown.
     """
-    return float(np.nan_to_num(_max_cut_m(load)[1])) / 2 + strap_m if load else 0.0
+    if not load:
+        return 0.0, 0.0
+    cut = float(np.nan_to_num(_max_cut_m(load)[1]))
+    return cut / 2 + strap_m, math.hypot(cut, strap_m) / math.sqrt(12)
 
 
 def _pulled(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:

@@ -7,6 +7,7 @@ the range of the stray field.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,23 +55,28 @@ _NO_BOUNDS = np.empty((0, 0), np.float32)
 class FacePlane:
     """Plane of the faces at rest on the map: height at the magnet's centre, slopes along and across, height
     sigma. It is compared with heights of that map, which cuts off what stands on a load as it cuts crests.
+    others: planes in which they may rest instead; at each place the lowest counts.
     """
 
     centre_z_m: float
     pitch_rad: float
     roll_rad: float
     sigma_m: float
+    others: tuple[FacePlane, ...] = ()
 
     @classmethod
-    def of(cls, contact: Contact) -> FacePlane:
-        """Take the plane from a contact."""
+    def of(cls, contact: Contact, others: Iterable[Contact] = ()) -> FacePlane:
+        """Take the plane from a contact, and those of the other ones."""
         height = contact.centre_z_m - contact.over_map_m
-        return cls(height, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
+        planes = tuple(cls.of(other) for other in others)
+        return cls(height, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m, planes)
 
     @property
     def table(self) -> Float64:
-        """Return (3,) the height (m) at the magnet's centre, and the slopes along and across."""
-        return np.array([self.centre_z_m, math.tan(self.pitch_rad), math.tan(self.roll_rad)])
+        """Return (1 + others, 3) heights (m) at the magnet's centre, and the slopes along and across."""
+        return np.array([
+            (one.centre_z_m, math.tan(one.pitch_rad), math.tan(one.roll_rad)) for one in (self, *self.others)
+        ])  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +93,14 @@ class Obstacle:
 
 
 def clearance_checks(
-    place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...],
+    place: Placement, heights: HeightMap, magnet: Magnet, faces: FacePlane, load: tuple[Bundle, ...],
     stanchions: tuple[tuple[float, float, float], ...],
 ) -> list[Check]:  # fmt: skip
     """Check that nothing, seen, unseen or stated, rises above the faces' plane under the magnet or beside it.
 
     The limits include the sigma of the plane in height and that of a cell in place.
     """
-    faces, sigma = FacePlane.of(contact), 1e3 * contact.gap_sigma_m
+    sigma = 1e3 * faces.sigma_m
     obstacle = find_obstacle(place, heights, magnet, faces, load)
     checks = []
     for code, what, bound_mm in (
@@ -126,10 +132,10 @@ def find_obstacle(
     beam passes over objects. careful: an object also obstructs if a limit lies within its sigma.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
-    plane = np.append(faces.table, faces.sigma_m if careful else 0.0)
+    planes = faces.table - (faces.sigma_m if careful else 0.0, 0.0, 0.0)
     rise, most, blocked = _look(
         heights.z_m, heights.source, _NO_BOUNDS if heights.free_m is None else heights.free_m,
-        np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
+        np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, planes,
         region.parts, region.under,
     )  # fmt: skip
     spare = region.parts[-1, 4] - MAX_RISE_M
@@ -144,15 +150,15 @@ def find_obstacle(
 @kernel()
 def _look(
     z: Float32, source: UInt8, free: Float32, at: Float64, x: Float64, y: Float64, frame: Float64,
-    plane: Float64, parts: Float64, under: UInt8,
+    planes: Float64, parts: Float64, under: UInt8,
 ) -> tuple[Float32, Float32, UInt8]:  # fmt: skip
     """Compute heights above the faces' plane (V, U), NaN where unknown: those that were seen (at least -1)
     and the upper bounds by lines of sight; and mark by 1 the cells that aren't proven free.
 
     z, source, free: maps (rows, columns); free is empty where there is none. at: x and y of the first cell,
     and its size. x, y: (U,), (V,) of the cells. frame: (3, 2) the magnet's place, unit vectors along and
-    across. plane: height at the place, slopes along and across, margin by which it may be lower. parts:
-    (P + 1, 5) poles and beam: middle along and across, reach to either side, allowed rise. Fills under
+    across. planes: (K, 3) heights at the place, slopes along and across; the lowest counts. parts: (P + 1, 5)
+    poles and beam: middle along and across, reach to either side, allowed rise. Fills under
     (V, U): 1 under a pole, _BEAM_ONLY under the beam alone, else 0.
     """
     rise, most = np.empty((y.size, x.size), np.float32), np.empty((y.size, x.size), np.float32)
@@ -164,7 +170,9 @@ def _look(
             column, dx = columns[k, 1], x[k] - frame[0, 0]
             v = dx * frame[1, 0] + dy * frame[1, 1]
             u = dx * frame[2, 0] + dy * frame[2, 1]
-            level = plane[0] + (v * plane[1] + u * plane[2]) - plane[3]
+            level = np.inf
+            for n in range(len(planes)):
+                level = min(level, planes[n, 0] + (v * planes[n, 1] + u * planes[n, 2]))
             allowed = parts[-1, 4]
             under[i, k] = 0
             for p in range(len(parts)):

@@ -12,9 +12,10 @@ from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.linalg.robust import mad_sigma
+from barsight.core.records.heights import HeightSource
 from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet.contact import Contact, rest_magnet
+from barsight.yard.magnet.contact import Contact, FaceHeights
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.resting_plane import SEGMENT_M
@@ -84,15 +85,18 @@ class SeenLabel:
 
 
 def rests_on_label(
-    label: SeenLabel, place: Placement, heights: HeightMap, magnet: Magnet, settings: LiftSettings
-) -> Iterator[Contact]:
-    """Yield how the magnet rests where a label is under its faces, for each part that may bear them."""
+    label: SeenLabel, place: Placement, faces: FaceHeights, bare: Contact, magnet: Magnet,
+    settings: LiftSettings,
+) -> Iterator[Contact]:  # fmt: skip
+    """Yield how the faces rest where a label is under them, for each part that may bear them; none for a part
+    below all that they touch where they are bare.
+    """
     top_z_m = max(label.steel_z_m + settings.label_m, label.own_z_m)
+    (plane,) = FacePlane.of(bare).table
     for part in _bearing_parts(label, place, magnet):
         plate = np.column_stack([part, np.full(len(part), top_z_m)])
-        contact = rest_magnet(heights, place, magnet, settings.contact_gap_m, plate)
-        if contact is not None:
-            yield contact
+        if (plane[0] + part @ plane[1:] - top_z_m <= bare.touch_gap_m).any():
+            yield faces.rest(magnet, settings.contact_gap_m, plate)
 
 
 def _bearing_parts(label: SeenLabel, place: Placement, magnet: Magnet) -> Iterator[Float64]:
@@ -132,7 +136,7 @@ def find_labels(
     median = median_level(heights.gray)
     min_level = min(MIN_RATIO * median, MIN_LEVEL)
     labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_level)
-    for mask in plate_masks(gray, z_m, SIZE_M, min(PAPER_RATIO * median, WHITE_LEVEL)):
+    for mask in plate_masks(gray, z_m, SIZE_M, min(PAPER_RATIO * median, WHITE_LEVEL), unknown_rise_m=0.0):
         labels |= mask
     labels &= ~is_low
     under = np.zeros(gray.shape, np.bool_)
@@ -225,7 +229,8 @@ def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
 
 
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
-    """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen.
+    """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen,
+    or a height was filled in.
 
     Levels are interpolated between the four nearest cells. Along slightly skewed bars the nearest cell jumps
     sideways from step to step, so that a bar's bright crest would seem to begin there.
@@ -236,7 +241,8 @@ def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tu
     assert heights.gray is not None
     nearest = np.where(inside, heights.gray[row, column], 0).astype(np.float32)
     between = sample_levels(heights, heights.gray, x, y)
+    seen = inside & ~np.isin(heights.source[row, column], (HeightSource.UNKNOWN, HeightSource.FILLED))
     return (
         np.where(np.isfinite(between), between, nearest),
-        np.where(inside, heights.z_m[row, column], np.float32(np.nan)),
+        np.where(seen, heights.z_m[row, column], np.float32(np.nan)),
     )
