@@ -90,6 +90,8 @@ def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
     """Yield the cells of each bright area of a label's size."""
     excess = _excess(gray, size_m)
     limit = max(MIDDLE_LOG, USUAL_RATIO * float(np.quantile(excess, 0.8)))
+    if excess.max() < limit:
+        return
     for cells in chain.from_iterable(_blobs(excess > level, size_m) for level in BRIGHTER_LOGS):
         ratio, full = _shape(cells, size_m)
         fits = (ratio >= MIN_SIDE_RATIO).all() and (ratio <= MAX_SIDE_RATIO).all() and full >= MIN_FULL_RATIO
@@ -102,6 +104,8 @@ def _codes(gray: Float32, size_m: tuple[float, float], white_level: float) -> It
     level, side = np.log(gray + _DARK), min(size_m)
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
+    if white.max() <= np.log(white_level):
+        return
     dark = np.where(gray > 0, white - level, np.float32(np.inf))
     lack = np.where((white > np.log(white_level)) & (gray > 0), dark, 0)
     for cells in chain.from_iterable(_blobs(lack > least, (side, side)) for least in CODE_LOGS):

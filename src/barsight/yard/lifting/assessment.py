@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.hold import SEVERAL, Hold, Task, hold_on_labels, label_check
 from barsight.yard.lifting.lift import Lift, LiftScene
@@ -132,7 +133,7 @@ def assess_place(place: Placement, yard: LiftScene, magnet: Magnet, settings: Li
         _scaled(magnet.tolerance, 0.0), _safety(hold, needed, mass, magnet),
         (*before, *resting, *after), valid,
         target_covariance(
-            place, load, math.hypot(contact.gap_sigma_m, contact.over_map_sigma_m),
+            place, load, math.hypot(contact.gap_sigma_m, hold.contact.over_map_sigma_m),
             _map_sigma(yard.heights, place, magnet), yard.travel, magnet.offset,
         ),
     )  # fmt: skip
@@ -156,12 +157,22 @@ def _grip(
     place: Placement, heights: HeightMap, magnet: Magnet, tolerance: Tolerance, near: BundleTable,
     contact: Contact,
 ) -> Grip:  # fmt: skip
-    """Count the bundles that the poles take, bounded by how far each one reaches on the map."""
-    reached = reached_strips(heights, place, magnet, tolerance, contact.map_z_m)
-    held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached)
+    """Count the bundles that the poles take, as certainly as their surface shows."""
+    held, reached = _taken(place, heights, magnet, tolerance, near, contact)
     clear = seen_clearances(held, heights, place, magnet, tolerance, near, contact.map_z_m, reached)
     held = count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached, clear)
     return without_parted(held, heights, place, near, reached)
+
+
+def _taken(
+    place: Placement, heights: HeightMap, magnet: Magnet, tolerance: Tolerance, near: BundleTable,
+    contact: Contact,
+) -> tuple[Grip, Float64]:  # fmt: skip
+    """Count the bundles that the poles take, bounded by how far each one reaches on the map; return that too.
+    Their surface changes only the probability.
+    """
+    reached = reached_strips(heights, place, magnet, tolerance, contact.map_z_m)
+    return count_gripped(place, magnet, tolerance, near, contact.map_z_m, reached), reached
 
 
 def _unseen_lift(place: Placement) -> Lift:
@@ -291,7 +302,7 @@ def _change(box: Tolerance, task: Task, assessed: Assessed, labels: tuple[SeenLa
         obstacle = find_obstacle(moved, heights, exact, FacePlane.of(bare, rests), load, careful=False)
         if obstacle is not None:
             return obstacle.reason
-        gripped = _grip(moved, heights, exact, exact.tolerance, assessed.near, bare).gripped
-        if held is None or gripped != held.gripped:
-            return f"the magnet would take {len(gripped)} bundles"
+        taken, _ = _taken(moved, heights, exact, exact.tolerance, assessed.near, bare)
+        if held is None or taken.gripped != held.gripped:
+            return f"the magnet would take {len(taken.gripped)} bundles"
     return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -71,6 +72,12 @@ class Hold:
             min(self.pried, other.pried), min(self.worst, other.worst),
         )  # fmt: skip
 
+    def off_by(self, off_m: float) -> Hold:
+        """Add to the height's sigma that the faces may rest as far (m) from it."""
+        own = self.contact
+        sigma, over = (math.hypot(one, off_m) for one in (own.sigma_m, own.over_map_sigma_m))
+        return replace(self, contact=replace(own, sigma_m=sigma, over_map_sigma_m=over))
+
     def checks(
         self, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], needed_n: float,
         settings: LiftSettings,
@@ -123,8 +130,8 @@ def hold_on_labels(
     """Hold the load wherever a label under a face may bear the faces; the reason if it isn't held there.
 
     checks: of `Task.checks` and `Task.clearance` for the bare rest, all passed. The faces' place stays that
-    of the bare rest; pull and ratios are the least of all rests, and each check is that of the rest which is
-    nearest to its limit.
+    of the bare rest, and its sigma contains how far off the others are; pull and ratios are the least of all
+    rests, and each check is that of the rest which is nearest to its limit.
     """
     least, rests, found = hold, list[Contact](), list[list[Check]]()
     if len(labels) > 1:
@@ -142,7 +149,8 @@ def hold_on_labels(
     for veto in vetoes_of(clear):
         return hold, checks, veto.reason
     nearest = (nearest_to_limit(ways) for ways in zip(checks, *found, strict=False))
-    return least, [*nearest, *clear], ""
+    off_m = max(abs(one.centre_z_m - hold.contact.centre_z_m) for one in rests)
+    return least.off_by(off_m), [*nearest, *clear], ""
 
 
 def label_check(place: Placement, labels: tuple[SeenLabel, ...], reason: str) -> Check:

@@ -10,6 +10,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
 from barsight.yard.magnet.reach import ALONG_M, MAX_SKEW, parts_beside
+from barsight.yard.magnet.seen_edges import SLIGHT
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 
@@ -35,7 +36,11 @@ def without_parted(
         return held
     load, flips = table.bundles[held.gripped[0]], held.flips.copy()
     for number, other in enumerate(table.bundles):
-        if flips[number] > 0 and number not in held.gripped and _parted(load, other, heights, place, reached):
+        if (
+            flips[number] > SLIGHT
+            and number not in held.gripped
+            and _parted(load, other, heights, place, reached)
+        ):
             flips[number] = 0.0
     return Grip(held.gripped, float(np.prod(1 - flips)), flips)
 

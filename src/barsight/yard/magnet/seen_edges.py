@@ -19,7 +19,7 @@ from barsight.yard.magnet.reach import DEEPER_M, MAX_SKEW, parts_beside
 from barsight.yard.magnet.resting_plane import ALL, SEEN, U, Z, profiles
 from barsight.yard.types import Bundle, HeightMap
 
-_SLIGHT = 1e-5
+SLIGHT = 1e-5
 """Probability of a wrong count from which a bundle's surface is looked at."""
 _SEEN_RATIO = 0.5
 """Minimum share of the cells of a place that must have been seen."""
@@ -50,7 +50,7 @@ def seen_clearances(
     clear = np.full((len(table.bundles), len(reached)), -np.inf)
     reach_z_m, faces = face_z_m - magnet.reach_m, _faces(place, magnet, tolerance)
     for number, bundle in enumerate(table.bundles):
-        if held.flips[number] <= _SLIGHT or abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > MAX_SKEW:
+        if held.flips[number] <= SLIGHT or abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > MAX_SKEW:
             continue
         looked = _looked(bundle, place, reached, is_gripped=number in held.gripped)
         if looked:

@@ -196,18 +196,24 @@ def mark_labels(gray: Float32, load: Bool, min_level: float = MIN_LEVEL) -> Bool
     needed = max(min(BRIGHTER_RATIO * float(np.median(gray[load])), FULL_LEVEL), min_level)
     bright = mean > np.log(needed + _DARK)
     marked = np.zeros(gray.shape, np.bool_)
-    for length in LENGTH_CELLS:
+    for length in LENGTH_CELLS if bright.any() else ():
         if length + 2 * _BESIDE > len(gray):
             break
         columns = _edge_logs(level, length)[0] > MIN_COLUMN_LOG
-        wide = ndimage.binary_erosion(columns, np.ones((1, WIDTH_CELLS), np.bool_))
         edges, lowest = _edge_logs(mean, length)
         room = math.log(MAX_LEVEL + _DARK) - (lowest - edges)
-        found = wide & (edges > np.clip(ROOM_RATIO * room, MIN_COLUMN_LOG, edge))
-        found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
-        for row in range(_BESIDE, _BESIDE + length):
-            marked[row : row + len(found)] |= found
-    white = ndimage.binary_opening(gray >= SATURATED_LEVEL, np.ones(WHITE_CELLS, np.bool_))
+        abrupt = edges > np.clip(ROOM_RATIO * room, MIN_COLUMN_LOG, edge)
+        count = columns.shape[1] - WIDTH_CELLS + 1
+        beside = [columns[:, k : k + count] for k in range(WIDTH_CELLS)]
+        middle = WIDTH_CELLS // 2
+        found = np.logical_and.reduce([*beside, abrupt[:, middle : middle + count]])
+        if not found.any():
+            continue
+        for row, k in itertools.product(range(_BESIDE, _BESIDE + length), range(WIDTH_CELLS)):
+            marked[row : row + len(found), k : k + count] |= found
+    white = gray >= SATURATED_LEVEL
+    if white.any():
+        white = ndimage.binary_opening(white, np.ones(WHITE_CELLS, np.bool_))
     return np.asarray((bright & marked) | white, np.bool_)
 
 
