@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from barsight.core.records.heights import HeightSource
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.pile_sides import pile_sides
 from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle
-from lift_yards import SETTINGS, SIGMA, laid, map_of, record
+from lift_yards import SETTINGS, SIGMA, codes, judged, laid, map_of, record
 
 RISE, STEP = 0.36, 0.08
 LEAN = math.degrees(math.atan2(2 * STEP, 2 * RISE))
@@ -103,3 +104,27 @@ def test_bundles_across_are_a_pile_of_their_own() -> None:
     sides = pile_sides(bundles, footings(map_of(STOCK), bundles, SETTINGS))
     assert sum(side.bundles == (10,) for side in sides) == 2 and len(sides) == 6
     assert pile_sides((), ()) == ()
+
+
+@pytest.mark.parametrize("gap_m", [0.06, 0.1])
+@pytest.mark.parametrize(("shown", "told"), [("gap", True), ("free", True), ("carried on", False)])
+def test_a_support_that_may_end_in_an_unseen_gap_forbids(gap_m: float, *, shown: str, told: bool) -> None:
+    """A bundle stands 130 mm beside the one below, with a neighbour of its layer beyond the gap: that the gap
+    is free down to half its height doesn't tell whether what carries it ends there.
+    """
+    width = laid(0.0).width_m
+    above = [laid(x, z=0.28 + width) for x in (0.13, 0.13 + width + gap_m)]
+    below = [laid(x) for x in (0.0, 0.13 + width + gap_m)]
+    heights = map_of([*above, *below], x_m=(-1.5, 2.5))
+    at = np.abs(heights.x_m - 0.13 - (width + gap_m) / 2) < gap_m / 2
+    free = np.full(heights.shape, np.inf, np.float32)
+    if shown == "carried on":
+        heights.z_m[:, at] = above[0].top_z_m - 1.2 * width
+    elif shown == "free":
+        heights.z_m[:, at], heights.source[:, at] = np.nan, HeightSource.UNKNOWN
+        free[:, at] = above[0].top_z_m - 0.12
+    heights = replace(heights, free_m=free)
+    bundles = tuple(record(one, k, layer=int(k < 2), on_top=k < 2) for k, one in enumerate((*above, *below)))
+    assert (
+        "overhanging" in codes(judged(above, bundles, Placement(0.13, 0.0, 0.0), heights=heights))
+    ) == told

@@ -77,7 +77,8 @@ class Footing:
 
     overhang_m: over the edge of what carries it, on overhang_side (-1 low, 1 high, 0 none), NaN where it
     isn't known; lean_deg: of the side below it. freeboard_m: height of the lowest stanchion beside it over
-    its top, NaN where there is none.
+    its top, NaN where there is none. hidden_m: overhang if what carries it ends in a gap beside it that
+    wasn't seen.
     """
 
     bundle: int
@@ -86,6 +87,7 @@ class Footing:
     overhang_side: int
     lean_deg: float
     freeboard_m: float
+    hidden_m: float = 0.0
 
 
 def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
@@ -102,18 +104,20 @@ def footings(heights: HeightMap, bundles: tuple[Bundle, ...], settings: LiftSett
 def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Footing:
     profiles = [_profile(heights, bundle, sign) for sign in (-1, 1)]
     low, high = (_side(profile, bundle) for profile in profiles)
-    low_falls, high_falls = (
-        side.drop_m > FREE_RATIO * bundle.width_m and not _is_flanked(profile, bundle)
-        for side, profile in zip((low, high), profiles, strict=True)
-    )
-    overhang, side, lean = math.nan, 0, 0.0
-    if bundle.layer > 0:
+    deep = [side.drop_m > FREE_RATIO * bundle.width_m for side in (low, high)]
+    beside = [_beside_m(profile, bundle) for profile in profiles]
+    overhang, side, lean, hidden = math.nan, 0, 0.0, 0.0
+    if bundle.layer > 0 and all(deep):
         for sign, outer, inner in ((-1, low, high), (1, high, low)):
             # A map blurs both edges alike: what shows equally on both sides doesn't reveal a shift.
             shift = inner.ledge_m - outer.ledge_m
-            if not (low_falls and high_falls and outer.ledge_m < MIN_LEDGE_M):
+            gap_m, inner_gap_m = beside if sign < 0 else beside[::-1]
+            if outer.ledge_m >= MIN_LEDGE_M or inner_gap_m is not None:
                 continue
-            if shift < MIN_LEDGE_M - STEP_M / 2:
+            if gap_m is not None:
+                is_edge = shift >= MIN_LEDGE_M and inner.ledge_m < 0.5 * bundle.width_m + MIN_LEDGE_M
+                hidden = inner.ledge_m if gap_m >= MIN_LEDGE_M and is_edge else hidden
+            elif shift < MIN_LEDGE_M - STEP_M / 2:
                 overhang = 0.0 if math.isnan(overhang) else overhang
             elif inner.ledge_m < 0.5 * bundle.width_m + MIN_LEDGE_M:
                 overhang, side = inner.ledge_m, sign
@@ -123,18 +127,20 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
         for x, y, z in settings.stanchions
         if _distance(bundle, x, y) < settings.beside_stanchion_m
     ]
-    return Footing(bundle.id, (low, high), overhang, side, lean, min(tops, default=math.nan))
+    return Footing(bundle.id, (low, high), overhang, side, lean, min(tops, default=math.nan), hidden)
 
 
-def _is_flanked(profile: Float64, bundle: Bundle) -> bool:
-    """Check whether something well above the bundle's underside stands close beside it before a place below
-    its support is seen, as a bundle of its own layer does: what carries both goes on there, or isn't known.
+def _beside_m(profile: Float64, bundle: Bundle) -> float | None:
+    """Find whether something well above the bundle's underside stands close beside it before a place below
+    its support is seen, as a bundle of its own layer does, and how much (m) wasn't seen between them; None
+    where nothing does. Where all is seen, what carries both goes on there.
     """
     z = np.where(profile[:, 1] >= MIN_KNOWN, profile[:, 0], np.nan)
     falls = np.flatnonzero(z <= _below_support(bundle))
     end = min(int(falls[0]) if falls.size else len(z), round(FLANKED_M / STEP_M) + 1)
-    beside = z[round(SHOULDER_M / STEP_M) : end]
-    return bool((beside > bundle.top_z_m - (1 - FLANKED_RATIO) * bundle.width_m).any())
+    first = round(SHOULDER_M / STEP_M)
+    high = np.flatnonzero(z[first:end] > bundle.top_z_m - (1 - FLANKED_RATIO) * bundle.width_m)
+    return float(np.isnan(z[: first + int(high[0])]).sum()) * STEP_M if high.size else None
 
 
 def _below_support(bundle: Bundle) -> float:
@@ -206,6 +212,12 @@ def footing_checks(
                 sigmas=UPPER,
             )
         )  # fmt: skip
+    if own.hidden_m > limit:
+        reason = (
+            f"it extends {mm * own.hidden_m:.0f} mm beyond what carries it if that ends beside it, where "
+            f"nothing was seen; the limit is {mm * limit:.0f} mm"
+        )
+        checks.append(check_true("overhanging", "what carries it doesn't end out of sight", None, reason))
     checks.append(
         check_max(
             "unstable-side", "lean of the side of the pile below it", own.lean_deg, settings.max_lean_deg,
