@@ -111,6 +111,10 @@ def test_the_stated_height_is_that_of_crests_and_straps_which_the_map_does_not_s
     assert contact.centre_z_m < true_m - 0.002
     for z_m in (held.centre_z_m, *held.z_m, *(pole.z_m for pole in held.poles)):
         assert z_m == pytest.approx(true_m, abs=0.002)
+    # Each part is as likely to be missing as whole.
+    raised, sigma = held.over_map_m, held.over_map_sigma_m
+    assert sigma == pytest.approx(math.hypot(2 * (raised - 0.0012), 0.0012) / math.sqrt(12))
+    assert held.sigma_m == pytest.approx(math.hypot(contact.sigma_m, sigma))
 
 
 def test_the_stated_heights_sigma_is_that_of_what_the_faces_touch() -> None:
