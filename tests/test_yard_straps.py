@@ -154,20 +154,25 @@ def test_straps_that_go_on_contradict_an_outline() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sides_m", "shown", "seen_m", "aside"),
+    ("sides_m", "shown", "seen_m", "aside_m"),
     [
-        ((-0.1, 0.0), True, None, False),
-        ((-0.1, 0.0), False, 0.21, False),
-        ((-0.1, 0.0), False, None, True),
-        ((-0.1, 0.0), False, 0.15, True),
-        ((-0.06, 0.0), True, None, True),
-        ((-0.1, 0.2), True, None, True),
+        ((-0.1, 0.0), True, None, 0.0),
+        ((-0.1, 0.0), False, (-0.105, 0.105), 0.0),
+        ((-0.1, 0.0), False, None, 0.05),
+        ((-0.1, 0.0), False, (-0.075, 0.075), 0.05),
+        ((-0.06, 0.0), True, None, 0.03),
+        ((-0.1, 0.2), True, None, 0.05),
+        ((-0.1, 0.0), False, (-0.055, 0.155), 0.05),
+        ((-0.075, 0.0), True, None, 0.025),
+        ((-0.075, 0.0), False, (-0.075, 0.135), 0.03),
     ],
 )
 def test_straps_on_a_part_of_an_outline_dont_move_it_where_more_shows_that_it_is_right(
-    sides_m: tuple[float, float], shown: bool, seen_m: float | None, aside: bool
+    sides_m: tuple[float, float], shown: bool, seen_m: tuple[float, float] | None, aside_m: float
 ) -> None:
-    """Outlines within 3 mm of the truth had a sigma of 50 mm: sun hid the straps on one half of the bars."""
+    """Outlines within 3 mm of the truth had a sigma of 50 mm: sun hid the straps on one half of the bars.
+    Then outlines whose straps and sides lie 55 mm aside had one of 3 mm.
+    """
     state, gain = np.zeros(1, np.uint8), np.zeros(1, np.float32)
     fit = Fit(1, 0.0, np.array([0, 0, 0, 0, 0, 0.2 / 3]), np.zeros((6, 6)), 0, 0, state, gain, 0.0, 0.0)
     grid = align_map(drawn([], np.random.default_rng(0)), 0.0, 0.05)
@@ -175,10 +180,14 @@ def test_straps_on_a_part_of_an_outline_dont_move_it_where_more_shows_that_it_is
     span = StrapSpan(*sides_m, straight(1.0, 2.0, 3.0), 0.0)
     pack = Pack(*sides_m, span, (-np.inf, np.inf), 0.1, (PackSide.SEEN, PackSide.OPEN))
     reading = Reading(FittedOutline(grid, fit, shades), 0.0, None, 0.0, None, pack)
-    seen = None if seen_m is None else SeenSection(seen_m, 0.0, sides_seen=True, sides_free=False)
+    seen = None
+    if seen_m is not None:
+        width, middle = seen_m[1] - seen_m[0], sum(seen_m) / 2
+        seen = SeenSection(width, 0.0, sides_seen=True, sides_free=False, middle_m=middle)
     bundle = record(laid(0.0), bars=None)
     held = held_by_straps(bundle, bundle.sigma, reading, seen, 0.0)
-    assert (held.sigma.lateral_m > 0.02) == aside
+    assert (held.sigma.lateral_m > 0.02) == (aside_m > 0.02)
+    assert held.sigma.lateral_m > 0.99 * aside_m
 
 
 @pytest.mark.parametrize("over_m", [0.1, 0.18, 0.36, np.inf])

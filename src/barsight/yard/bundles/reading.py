@@ -51,20 +51,25 @@ class Reading:
         """Return the maximum distance (m) between edges, or difference of widths, that count as the same."""
         return _SAME_RATIO * self.found.fit.width_m + _SAME_M
 
-    def holds_straps(self, seen: SeenSection | None) -> bool:
-        """Check whether straps that show on a part of the outline lie within it and end at one of its edges,
-        and something else shows that it is the bundle's: its packing in the photo, or both its sides.
+    def straps_aside_m(self, seen: SeenSection | None) -> float:
+        """Return how far (m) what shows of straps puts the pack's middle aside of the outline's.
+
+        Straps on a part of the outline that lie within it and end at one of its edges tell its place by that
+        edge alone, if something else shows that it is the bundle's: its packing in the photo, or both its
+        sides, which also tell its place.
         """
         pack, half, same_m = self.pack, self.found.fit.width_m / 2, self.same_m
         if pack is None:
-            return False
+            return 0.0
         beyond = -half - pack.low_m, pack.high_m - half
-        ends = zip(pack.sides, beyond, strict=True)
-        if max(beyond) > same_m or not any(s == PackSide.SEEN and abs(off) < same_m for s, off in ends):
-            return False
+        off = [abs(one) for side, one in zip(pack.sides, beyond, strict=True) if side == PackSide.SEEN]
+        if max(beyond) > same_m or not off or min(off) >= same_m:
+            return abs(pack.middle_m)
         if self.found.shades is not None:
-            return True
-        return seen is not None and seen.sides_seen and abs(seen.width_m - 2 * half) < same_m
+            return min(off)
+        if seen is None or not seen.sides_seen or abs(seen.width_m - 2 * half) >= same_m:
+            return abs(pack.middle_m)
+        return max(min(off), abs(seen.middle_m))
 
     @property
     def ends_inside(self) -> bool:

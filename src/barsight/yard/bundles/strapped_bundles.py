@@ -126,8 +126,7 @@ def _held(
     pack = reading.pack
     assert pack is not None
     if not pack.is_bounded:
-        aside_m = 0.0 if reading.holds_straps(seen) else abs(pack.middle_m)
-        return _partly_seen(bundle, irregular, pack, aside_m)
+        return _partly_seen(bundle, irregular, pack, reading.straps_aside_m(seen))
     if reading.outlines_pack:
         if bundle.bars is not None and pack.sides_seen:
             return bundle

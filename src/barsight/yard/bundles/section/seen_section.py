@@ -81,7 +81,8 @@ class SeenSection:
 
     width_m: from side to side, with its sigma. misfit_m: RMS of the mean section over the outline of a full
     hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
-    sides_free: both fall to the floor. hidden_m: length out of sight behind the low and the high side.
+    both fall to the floor. hidden_m: length out of sight behind the low and the high side. middle_m: place
+    midway between the sides, beside the outline's axis.
     """
 
     width_m: float
@@ -90,6 +91,7 @@ class SeenSection:
     sides_free: bool
     hidden_m: tuple[float, float] = (0.0, 0.0)
     width_sigma_m: float = 0.012
+    middle_m: float = 0.0
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
@@ -130,6 +132,7 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
             grid.cell_m * unseen_places(level[: ends[0][0]][::-1]),
             grid.cell_m * unseen_places(level[ends[1][0] + 1 :]),
         ),
+        middle_m=float(beside[ends[0][0]] + beside[ends[1][0]]) / 2,
     )
 
 
