@@ -378,6 +378,24 @@ def test_a_single_gully_before_other_straps_is_the_flank(
         assert pack.high_m == pytest.approx(0.13, abs=1.1 * CELL)
 
 
+@pytest.mark.parametrize(
+    ("right", "begins_m", "is_other"),
+    [
+        (((0.07, 0.0), (0.13, -0.09), (0.14, -1.0), (0.4, -1.0)), 0.08, False),
+        (((0.3, 0.0), (0.31, -1.0), (0.4, -1.0)), 0.09, False),
+        (((0.05, 0.0), (0.09, -0.01), (0.13, 0.0), (0.4, 0.0)), 0.09, True),
+        (((0.05, 0.0), (0.09, -0.03), (0.1, np.nan), (0.12, np.nan), (0.13, -0.03), (0.4, -0.03)), 0.1, True),
+    ],
+    ids=["on its own flank", "on a level top", "behind a dent", "behind what isn't seen"],
+)  # fmt: skip
+def test_straps_of_others_lie_behind_a_dent(
+    right: tuple[tuple[float, float], ...], begins_m: float, is_other: bool
+) -> None:
+    """Straps on a flank, 30 mm off along the bars from those on the crest, were told as other bundles'."""
+    pack = pack_beside(level_of(*LEFT, *right), OTHER_ROWS, begins_m)
+    assert pack.others_m == (-np.inf, begins_m if is_other else np.inf)
+
+
 DEEP = (0.09, -0.05), (0.13, -0.12), (0.2, -0.01), (0.4, 0.0)
 
 

@@ -37,6 +37,10 @@ _MIN_WIDTH_BARS = 1.5
 """Minimum width of a strapped pack, in diameters of its bars."""
 _BEYOND_M = 0.03
 """Distance (m) by which straps beyond an outline, or others' straps inside it, contradict the outline."""
+_DENT_M = 0.006
+"""Minimum depth (m) of the dent between two bundles: without one, what looks like another's straps are lines
+on the same bundle.
+"""
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,10 @@ class Pack:
     """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis.
 
     span: width of the straps themselves; others_m: where other bundles' straps begin on either side, infinite
-    where there are none. top_m: highest place over the axis; sides: the low and the high one. diameter_m: of
-    its bars by the dark lines along it, NaN where these aren't seen. hidden_m: length out of sight behind the
-    low and the high flank, where bars may bulge. bare_m: rise of a crest that no strap crosses.
+    where there are none, or no dent parts them from its own. top_m: highest place over the axis; sides: the
+    low and the high one. diameter_m: of its bars by the dark lines along it, NaN where these aren't seen.
+    hidden_m: length out of sight behind the low and the high flank, where bars may bulge. bare_m: rise of a
+    crest that no strap crosses.
     """
 
     low_m: float
@@ -145,7 +150,8 @@ def find_pack(
             near = other.high_m if step < 0 else other.low_m
             begin = max(round((abs(near - float(beside_m[at])) - cell / 2) / cell), 0)
             break
-        others.append(float(near) if begin is not None and shared is False else step * np.inf)
+        is_other = begin is not None and shared is False and _is_parted(own, other, beside_m, level_m)
+        others.append(float(near) if is_other else step * np.inf)
         around = level_m[at::step], level_m[at::-step]
         last, side = find_side(*around, begin, None if shared else shared, top, own.width_m, cell, thick_m)
         if shared and side is PackSide.SEEN:
@@ -168,6 +174,19 @@ def _lies_below(span: StrapSpan, beside_m: Float64, level_m: Float64, deep_m: fl
     """Check whether straps belong to another layer: most of what they hold lies below a pack's flanks."""
     seen = level_m[(beside_m >= span.low_m) & (beside_m <= span.high_m) & ~np.isnan(level_m)]
     return bool(seen.size and np.median(seen) <= deep_m)
+
+
+def _is_parted(own: StrapSpan, other: StrapSpan, beside_m: Float64, level_m: Float64) -> bool:
+    """Check whether the surface sinks between the highest places that two spans hold, as between bundles: a
+    flank's own straps, seen aside of those on its crest, may look like another's.
+    """
+    highest = []
+    for span in (own, other):
+        inside = np.flatnonzero((beside_m >= span.low_m) & (beside_m <= span.high_m) & np.isfinite(level_m))
+        if not inside.size:
+            return True
+        highest.append(int(inside[np.argmax(level_m[inside])]))
+    return dip_depth(level_m[min(highest) : max(highest) + 1]) >= _DENT_M
 
 
 def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
