@@ -13,6 +13,7 @@ from barsight.bundle_pictures.flanks import MeanSection, takes_another, with_fla
 from barsight.bundle_pictures.profiles import PitchProfile, pitch_windows
 from barsight.bundle_pictures.samples import PlacedFrames, sample_windows
 from barsight.bundle_pictures.strap_ends import StrapEnds, find_straps, strap_windows, view_tilt
+from barsight.bundle_pictures.told_straps import tell_straps
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.bundles.floor import find_floor
@@ -38,11 +39,12 @@ class ShownBundles:
 def measure_from_pictures(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
 ) -> tuple[Bundle, ...]:
-    """Measure the flanks and bar diameters of bundles whose bars aren't counted, and doubt free bundles that
-    an edge crosses. See `with_flanks` and `with_pitch`.
+    """Tell straps from thin bars, measure the flanks and bar diameters of bundles whose bars aren't counted,
+    and doubt free bundles that an edge crosses. See `tell_straps`, `with_flanks` and `with_pitch`.
 
     poses: reference_from_body by the stamp of each frame that may be used.
     """
+    bundles = tell_straps(pairs, poses, heights, bundles)
     numbers = [k for k, bundle in enumerate(bundles) if bundle.bars is None]
     unsure = [bundles[k] for k in numbers]
     shown = look_at_bundles(pairs, poses, heights, unsure, bundles)

@@ -88,8 +88,11 @@ class PlacedFrames:
         return cls(tuple(poses), cameras, eyes, (camera.width, camera.height))
 
     def nearest(self, window: BundleWindow, preferred: Collection[int] = ()) -> int | None:
-        """Find the index of the nearest frame whose left picture shows the whole window; None if there is
-        none.
+        """Find the index of the first of `all_nearest`; None if there is none."""
+        return next(self.all_nearest(window, preferred), None)
+
+    def all_nearest(self, window: BundleWindow, preferred: Collection[int] = ()) -> Iterator[int]:
+        """List the indices of the frames whose left picture shows the whole window, the nearest first.
 
         Frames in `preferred` come first.
         """
@@ -98,8 +101,7 @@ class PlacedFrames:
         for k in [k for k in numbers if k in preferred][:_TRIED] + numbers[:_TRIED]:
             at, _ = self.cameras[k][0].project(window.corners_m)
             if bool(((at >= 1) & (at <= np.array(self.size_px) - 2)).all()):
-                return int(k)
-        return None
+                yield int(k)
 
 
 def is_placed(bundle: Bundle) -> bool:

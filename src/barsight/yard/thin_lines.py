@@ -57,6 +57,8 @@ MAX_SATURATED_RATIO, SATURATED_M = 0.65, 0.2
 """Maximum share of a load's cells that may be saturated, over a length (m) that is longer than a label."""
 APART_M = 0.1
 """Minimum distance (m) along a bundle between two lines; closer ones are one."""
+STRAP_M, STRAP_SLOPE = 0.035, 0.17
+"""Distance (m) along a bundle from one of its known straps, and slope, within which lines are that strap."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
 MAX_SLOPE = float(_SLOPES.max())
 """Maximum slope of a line relative to the perpendicular of the bundle's axis."""
@@ -85,13 +87,15 @@ class ThinLine:
 
 
 def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] | None:
-    """Find the strongest line across a bundle in the top photo, then all others over the limit; None where
-    too little of the bundle is seen, or a part of it is saturated.
+    """Find the strongest line across a bundle in the top photo that isn't a known strap, then all others over
+    the limit; None where too little of the bundle is seen, or a part of it is saturated.
     """
     found = line_strengths(heights, bundle)
     if found is None:
         return None
     along, strength = found
+    for strap in bundle.straps_m:
+        strength[np.ix_(np.abs(_SLOPES) < STRAP_SLOPE, np.abs(along - strap) < STRAP_M)] = 0.0
     limit = MAX_STRENGTH * math.sqrt(min(bundle.width_m / WIDE_M, 1.0))
     number, best = strength.argmax(axis=0), strength.max(axis=0)
     peaks = best == maximum_filter1d(best, 2 * round(APART_M / STEP_M) + 1)

@@ -245,6 +245,7 @@ class Bundle:
     bundles it touches. known_share: share of its outline that was measured. confidence: probability that a
     bundle lies here as described. reasons: all doubts about it. label: None where none was seen, or labels
     weren't read. fit_sigma: of the outline's fit alone; None where straps determine the place instead.
+    straps_m: places of straps along the axis, from its middle, that the pictures tell from thin bars.
     map_sigma_z_m: of heights there, including the calibration's part, which the whole map shares and which
     isn't in `sigma`; NaN where it isn't known.
     """
@@ -275,6 +276,7 @@ class Bundle:
     label: BundleLabel | None = None
     fit_sigma: FitSigma | None = None
     map_sigma_z_m: float = float("nan")
+    straps_m: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         size = f"{self.length_m:.2f} m x {self.width_m:.2f} m"

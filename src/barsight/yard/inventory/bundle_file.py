@@ -112,6 +112,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "confidence": bundle.confidence,
         "reasons": [doubt.sentence for doubt in bundle.reasons],
         "label": bundle.label,
+        "straps_m": list(bundle.straps_m),
         "bar_axes": [
             {
                 "centre_m": bar.centre_m,
@@ -179,6 +180,7 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         label=BundleLabel(**record["label"]) if record.get("label") else None,
         fit_sigma=FitSigma(yaw_rad=float(np.radians(fit.pop("yaw_deg"))), **fit) if fit else None,
         map_sigma_z_m=figure(record.get("map_sigma_z_m")),
+        straps_m=tuple(figures_of(record.get("straps_m", [])).tolist()),
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(
