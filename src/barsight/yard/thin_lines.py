@@ -57,7 +57,7 @@ MAX_SATURATED_RATIO, SATURATED_M = 0.65, 0.2
 """Maximum share of a load's cells that may be saturated, over a length (m) that is longer than a label."""
 APART_M = 0.1
 """Minimum distance (m) along a bundle between two lines; closer ones are one."""
-STRAP_M, STRAP_SLOPE = 0.035, 0.17
+STRAP_M, STRAP_SLOPE = 0.025, 0.17
 """Distance (m) along a bundle from one of its known straps, and slope, within which lines are that strap."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
 MAX_SLOPE = float(_SLOPES.max())
