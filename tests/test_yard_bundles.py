@@ -27,7 +27,7 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import list_overlaps
 from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.flanks import Flanks
+from barsight.yard.bundles.section.flanks import Flanks, _flank
 from barsight.yard.bundles.section.laid_objects import measure_laid
 from barsight.yard.bundles.section.seen_section import (
     SeenSection,
@@ -459,6 +459,21 @@ def test_a_neighbour_that_may_lie_over_a_flank_leaves_open_what_lies_on_it() -> 
     for fall, is_sure in ((0.07, False), (0.08, True)):
         flanks = Flanks(0.25, (0.1, fall), (-np.inf, 0.1), False)
         assert not flanks.doubt and (not flanks.cover_doubt) is is_sure
+
+
+@pytest.mark.parametrize(
+    ("behind_m", "fall_m", "rise_m"),
+    [(-np.inf, np.inf, -np.inf), (-0.2, np.inf, -0.2), (-0.1, 0.02, 0.1), (np.nan, 0.02, 0.1)],
+)
+def test_a_sheer_flank_is_seen_where_what_shows_behind_is_deeper_than_the_bundle(
+    behind_m: float, fall_m: float, rise_m: float
+) -> None:
+    """A top 0.28 m wide falls by 20 mm; behind 40 mm out of sight and 40 mm more a higher bundle begins."""
+    outwards = np.arange(-14, 30) * 0.01
+    level = np.where(outwards < 0.135, np.where(outwards > 0.1, -0.02, 0.0), np.nan)
+    level[(outwards > 0.175) & (outwards < 0.215)] = behind_m
+    level[outwards > 0.215] = 0.1
+    assert _flank(outwards, level, 0.0, 0.28) == (0.02, fall_m, rise_m)
 
 
 @pytest.mark.parametrize(("rise_m", "is_free"), [(-0.05, True), (0.15, False), (0.4, False)])

@@ -396,6 +396,16 @@ def test_straps_of_others_lie_behind_a_dent(
     assert pack.others_m == (-np.inf, begins_m if is_other else np.inf)
 
 
+def test_a_top_as_wide_as_it_is_seen_ends_where_the_floor_shows_behind() -> None:
+    """It rises by 4 mm before its edge; a higher bundle stands behind the floor."""
+    level = level_of(*LEFT, (0.09, -0.004), (0.13, 0.0), (0.4, 0.0))
+    level[(BESIDE > 0.125) & (BESIDE < 0.165)] = np.nan
+    level[(BESIDE > 0.165) & (BESIDE < 0.205)] = -np.inf
+    level[BESIDE > 0.205] = 0.1
+    pack = pack_beside(level, OTHER_ROWS, 0.21)
+    assert pack.sides_seen and pack.high_m == pytest.approx(0.125, abs=CELL)
+
+
 DEEP = (0.09, -0.05), (0.13, -0.12), (0.2, -0.01), (0.4, 0.0)
 
 

@@ -29,6 +29,10 @@ A flank that falls by less than the first isn't seen. Beside a neighbour that ri
 neither is one that falls by less than the second, and one that falls by less than the third isn't certain.
 A neighbour that rises by the whole width is a separate stack.
 """
+_ENDED_RATIO = 0.6
+"""Minimum depth, in widths, under the crest of a place beside a flank that can't be the bundle's own: a round
+one is widest half its width under its top.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,18 +103,22 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
 def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
     """Measure one side from the crest (m): the fall before its edge; the fall including what a map extends
     over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank
-    or nothing was measured beside it; and the rise of what lies beyond, NaN where nothing was measured.
+    or nothing was measured beside it; and the rise of what lies beyond, NaN where nothing was measured. What
+    stands behind a place that is deeper than the bundle can't lie over it.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]
-    own = level[(outwards > first) & (outwards < last)]
-    beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M)]
     before = crest - inner[np.isfinite(inner)].min(initial=crest)
     measured = ~np.isnan(level) & (outwards < edge + _BEYOND_M)
     furthest = int(np.flatnonzero(measured)[outwards[measured].argmax()])
     if outwards[furthest] < edge + _BESIDE_M and crest - level[furthest] < width:
         return float(before), 0.0, np.nan
+    ended = (outwards > first) & (crest - level > _ENDED_RATIO * width)
+    end = outwards[ended].min(initial=np.inf)
+    own = level[(outwards > first) & (outwards < min(last, end))]
+    beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M) & (outwards <= end)]
     rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
     seen = own[~np.isnan(own)]
     lowest = seen.min() if seen.size else crest if own.size and rise > _HIGHER_M else -np.inf
-    return float(before), float(crest - lowest), float(rise)
+    fall = np.inf if end < last + _BESIDE_M else crest - lowest
+    return float(before), float(fall), float(rise)

@@ -215,7 +215,8 @@ def _fall(level: Float64, limit: int, deep: float) -> tuple[int, bool]:
         if np.isnan(level[k]):
             behind = level[k : k + _HIDDEN_CELLS]
             behind = behind[~np.isnan(behind)]
-            return lowest, bool(behind.size and behind[0] <= deep)
+            falls = bool(behind.size and behind[0] <= deep)
+            return k - 1 if falls else lowest, falls
         if level[k] <= deep:
             last = lowest
             while k <= limit and k < len(level) and -_RISES_M < level[last] - level[k] < _STEP_M:
