@@ -12,7 +12,7 @@ import yard_maps
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.section import straps
-from barsight.yard.bundles.section.laid_objects import StraightSections, measure_along
+from barsight.yard.bundles.section.laid_objects import StraightSections, measure_along, measure_laid
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw, photographed
 
@@ -67,8 +67,31 @@ def test_a_ridge_over_the_fitted_outline_lies_along_whatever_the_straps_bound() 
     """A pack's top, which straps bound, holds the bar."""
     beside = 0.01 * np.arange(25) - 0.12
     z = np.tile(np.where(np.abs(beside) < 0.025, 0.27, 0.24), (200, 1))
-    assert measure_along(StraightSections(z, 0.15, 0.24, 0.24, 0.01)) == pytest.approx(0.03)
-    assert measure_along(StraightSections(z, 0.15, 0.27, 0.24, 0.01)) == 0.0
+    sure = np.zeros_like(z)
+    rises = (pytest.approx(0.03), pytest.approx(0.03))
+    assert measure_along(StraightSections(z, sure, 0.15, 0.24, 0.24, 0.01)) == rises
+    assert measure_along(StraightSections(z, sure, 0.15, 0.27, 0.24, 0.01)) == (0.0, 0.0)
+
+
+def test_what_a_map_is_unsure_of_only_may_lie_along() -> None:
+    """A fifth of the crest is 30 mm too high, and its sigma exceeds the others by 5 or 20 mm."""
+    beside = 0.01 * np.arange(25) - 0.12
+    z = np.full((200, 25), 0.24)
+    z[80:120, np.abs(beside) < 0.025] = 0.27
+    for unsure_m, sure in ((0.005, 0.025), (0.02, 0.01)):
+        unsure = np.where(z > 0.25, unsure_m, 0.0)
+        rises = (pytest.approx(0.03), pytest.approx(sure))
+        assert measure_along(StraightSections(z, unsure, 0.15, 0.24, 0.24, 0.01)) == rises
+
+
+@pytest.mark.parametrize(("unsure_m", "is_clear"), [(0.01, True), (0.025, False)])
+def test_what_a_map_is_unsure_of_only_may_lie_on_a_bundle(unsure_m: float, *, is_clear: bool) -> None:
+    """A patch of 0.1 m by 40 mm is 40 mm too high."""
+    z = np.full((200, 25), 0.24)
+    z[80:90, 20:24] = 0.28
+    unsure = np.where(z > 0.25, unsure_m, 0.0)
+    laid = measure_laid(StraightSections(z, unsure, 0.12, 0.24, 0.24, 0.01))
+    assert laid == (pytest.approx(0.04), is_clear)
 
 
 @pytest.mark.parametrize("is_bare", [True, False])

@@ -342,7 +342,9 @@ def _reading_of(z_m: Float64, width_m: float, *, pack_only: bool = False) -> Rea
     pack = SimpleNamespace(
         is_bounded=True, low_m=-width_m / 2, high_m=width_m / 2, width_m=width_m, top_m=fitted_m / 2
     )
-    grid = SimpleNamespace(z_m=z_m, cell_m=0.01, u0_m=-width_m / 2, v0_m=-1.0)
+    grid = SimpleNamespace(
+        z_m=z_m, sigma_m=np.full_like(z_m, 0.003), cell_m=0.01, u0_m=-width_m / 2, v0_m=-1.0
+    )
     reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=pack if pack_only else None)
     return cast(Reading, reading)
 

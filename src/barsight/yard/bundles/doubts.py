@@ -207,9 +207,15 @@ def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Dou
     elif laid > 0:
         said = f"something {1e3 * laid:.0f} mm high beside it may lie over its flank"
         out.append(Doubt(DoubtKind.HIDDEN_FLANK, said))
-    if (along := measure_along(sections)) > _ALONG_M:
+    along, sure = measure_along(sections)
+    if sure > _ALONG_M:
         said = f"something {1e3 * along:.0f} mm over its outline, or over its other parts, lies along on it"
         out.append(Doubt(DoubtKind.OTHER, said))
+    elif along > _ALONG_M:
+        said = (
+            f"along it the map rises by {1e3 * along:.0f} mm where it is unsure: a thin bar may lie over it"
+        )
+        out.append(Doubt(DoubtKind.FAINT_LINE, said))
     if reading.pack is not None and reading.pack.bare_m > _BARE_M:
         out.append(Doubt(DoubtKind.OTHER, "no strap crosses its crest: something lies along on its straps"))
     if reading.flanks is not None and reading.flanks.cover_doubt:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.fitting.outline_fit import SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
@@ -45,10 +45,12 @@ class StraightSections:
     """The heights (R, C) of a bundle's rows from flank to flank, less the rise along its axis, NaN where
     unknown. The rows of a bowed bundle are shifted sideways into line.
 
-    axis_z_m: height of its axis. outline_z_m: that of the fitted outline's top.
+    unsure_m: by how much each height's sigma exceeds the bundle's median one. axis_z_m: height of its axis.
+    outline_z_m: that of the fitted outline's top.
     """
 
     z_m: Float64
+    unsure_m: Float64
     axis_z_m: float
     outline_z_m: float
     width_m: float
@@ -79,25 +81,36 @@ def straight_sections(
         if cost < least:
             best, least = bow, cost
     z = look_up(grid, fit, rows, beside + best * parabola)
+    _, column, inside = _cells(grid, fit, rows, beside + best * parabola)
+    sigma = np.where(inside, grid.sigma_m[rows[:, None], column], np.nan)
+    unsure = np.maximum(sigma - np.nanmedian(sigma), 0) if np.isfinite(sigma).any() else np.zeros_like(z)
     outline_z_m = float(fit.values[Z]) + fit.width_m / 2
-    return StraightSections(z, axis_z_m, outline_z_m, high_m - low_m, grid.cell_m)
+    return StraightSections(z, unsure, axis_z_m, outline_z_m, high_m - low_m, grid.cell_m)
 
 
 def look_up(grid: AlignedMap, fit: Fit, rows: Int64, beside: Float64) -> Float64:
     """Look up the heights (R, C) of a bundle's rows at places beside its axis, (C,) or (R, C), less the rise
     along it; NaN where unknown.
     """
-    along = grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m
+    along, column, inside = _cells(grid, fit, rows, beside)
+    z = grid.z_m[rows[:, None], column]
+    return np.where(inside, z - fit.values[SLOPE_Z] * along, np.nan)
+
+
+def _cells(grid: AlignedMap, fit: Fit, rows: Int64, beside: Float64) -> tuple[Float64, Int64, Bool]:
+    """Find a bundle's rows' places along (R, 1), their columns (R, C) at places beside its axis, and whether
+    the map has these.
+    """
+    along = np.asarray(grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m, np.float64)
     column = np.rint((fit.values[U] + fit.values[SLOPE_U] * along + beside - grid.u0_m) / grid.cell_m)
     inside = (column >= 0) & (column < grid.z_m.shape[1])
-    z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
-    return np.where(inside, z - fit.values[SLOPE_Z] * along, np.nan)
+    return along, np.where(inside, column, 0).astype(np.int64), inside
 
 
 def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
     does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
-    the section is shifted sideways by a cell.
+    the section is shifted sideways by a cell, and where its heights are unsure, even if these are too high.
 
     Rises are measured over the bundle's own section. An object is a patch that everywhere holds a rectangle
     of _LAID_SIZE_M and rises by _LAID_M. An object no higher than the axis, where a gully shows at the rim,
@@ -115,22 +128,28 @@ def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
     fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
     laid = ndimage.binary_dilation(fits, square) & rises
-    return float((z - own)[laid].max(initial=0.0)), bool((z - _shifted(own) > _LAID_M)[laid].any())
+    clear = z - sections.unsure_m - _shifted(own) > _LAID_M
+    return float((z - own)[laid].max(initial=0.0)), bool(clear[laid].any())
 
 
-def measure_along(sections: StraightSections | None) -> float:
+def measure_along(sections: StraightSections | None) -> tuple[float, float]:
     """Measure the rise (m) of what lies along on a bundle, 0 where none is known: that of its own section
     over the fitted outline's top, as with a bar as long as the bundle, or that of a part of it over its
-    lower parts, even if these are shifted sideways by a cell, as with a shorter bar.
+    lower parts, even if these are shifted sideways by a cell, as with a shorter bar. Also return the rise
+    that is left where unsure heights are too high.
     """
     if sections is None:
-        return 0.0
+        return 0.0, 0.0
     cells = max(round(_LAID_SIZE_M[1] / sections.cell_m), 1)
-    ridge = ndimage.minimum_filter1d(_known(sections.own_m[0]), cells)
-    return float(max(ridge.max() - sections.outline_z_m, _rise_of_part(sections), 0.0))
+    rises = []
+    for unsure in (np.zeros_like(sections.z_m), sections.unsure_m):
+        own = sections.own_m[0] - known_median(unsure)[0]
+        ridge = ndimage.minimum_filter1d(_known(own), cells)
+        rises.append(float(max(ridge.max() - sections.outline_z_m, _rise_of_part(sections, unsure), 0.0)))
+    return rises[0], rises[1]
 
 
-def _rise_of_part(sections: StraightSections) -> float:
+def _rise_of_part(sections: StraightSections, unsure_m: Float64) -> float:
     """Measure by how much (m) the highest part along a bundle rises over its lower parts; -inf if unknown.
 
     What all of a part's width rises by is no bar on it: bundles of thin bars sag between their timbers.
@@ -145,6 +164,7 @@ def _rise_of_part(sections: StraightSections) -> float:
         np.where(np.isfinite(part).mean(axis=0) > _MIN_PART_SEEN, known_median(part), np.nan)
         for part in np.array_split(z, count)
     ])  # fmt: skip
+    unsure = np.concatenate([known_median(part) for part in np.array_split(unsure_m, count)])
     # NaN sorts last.
     known = np.isfinite(parts).sum(axis=0)
     at = np.maximum((known - 1) * _LOWER_PCT // 100, 0)
@@ -152,7 +172,8 @@ def _rise_of_part(sections: StraightSections) -> float:
     raised = np.where(inner, parts - lower, np.nan).T
     at = np.maximum(np.isfinite(raised).sum(axis=0) - 1, 0) * _SAG_PCT // 100
     sag = np.take_along_axis(np.sort(raised, axis=0), at[None], axis=0).T
-    rise = np.where(np.isfinite(parts) & inner, parts - _shifted(lower) - np.fmax(sag, 0), -np.inf)
+    over = parts - np.nan_to_num(unsure) - _shifted(lower) - np.fmax(sag, 0)
+    rise = np.where(np.isfinite(parts) & inner, over, -np.inf)
     cells = max(round(_PART_WIDTH_M / sections.cell_m), 1)
     return float(ndimage.minimum_filter(rise, (1, cells), mode="constant", cval=-np.inf).max())
 
