@@ -108,3 +108,14 @@ def test_covered_bundles_alone_are_not_looked_at_and_the_doubt_forbids() -> None
     earlier = "an edge runs over its flank +0.40 m from its middle: a thin bar may lie over it"
     for sentence in (one.reasons[-1].sentence, earlier):
         assert Doubt.read(sentence).kind is DoubtKind.CROSSING_EDGE
+
+
+@pytest.mark.parametrize(("line_m", "on_top"), [(0.31, None), (-0.6, True)])
+def test_a_line_and_an_edge_at_one_place_leave_open_whether_a_bundle_is_free(
+    line_m: float, on_top: bool | None
+) -> None:
+    """A strap shows as a line, a tag as an edge; only what lies across shows as both."""
+    line = Doubt.read(f"a line runs across it {line_m:+.2f} m from its middle: a thin bar may lie over it")
+    crossed = with_edge(bundle().with_cover_doubt(line), 0.35)
+    assert crossed.on_top is on_top and len(crossed.cover_doubts) == 2
+    assert with_edge(replace(bundle(), on_top=False, cover_doubts=(line,)), line_m).on_top is False

@@ -7,6 +7,7 @@ von Gioi 2010, LSD], dark or bright; segments in line with each other may be sep
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -38,6 +39,10 @@ _SAME_SLOPE, _SAME_M = 0.06, 0.008
 _BESIDE_FREE_M, _BELOW_FREE_M = 0.8, 0.3
 """Distance from a free bundle, and depth of a top below that bundle's top, within which a thing on another
 bundle may reach the free one.
+"""
+_SAME_PLACE_M = 0.1
+"""Maximum distance (m) along the axis between a line, where it crosses the axis, and an edge, where it
+crosses a flank, of the same object.
 """
 _REACH_M, _MIN_COVERED_RATIO, _MAX_GAP_M = 0.1, 0.6, 0.06
 """An edge runs over a flank if it shows on at least this share of the reach to either side of the flank,
@@ -166,9 +171,15 @@ def _is_covered(low: Float64, high: Float64, first: float, last: float) -> bool:
 
 
 def with_edge(bundle: Bundle, along_m: float) -> Bundle:
-    """Return the bundle with the doubt that an edge runs across it."""
+    """Return the bundle with the doubt that an edge runs across it. Whether it is free isn't known where a
+    faint line runs across it at the same place: a line alone is most often a strap, but that has no edge
+    beyond the flanks.
+    """
     doubt = Doubt(
         DoubtKind.CROSSING_EDGE,
         f"{DoubtKind.CROSSING_EDGE.value} {along_m:+.2f} m from its middle: something may lie over it",
     )
+    lines = [one.along_m for one in bundle.cover_doubts if one.kind is DoubtKind.FAINT_LINE]
+    if bundle.on_top and any(abs(line_m - along_m) < _SAME_PLACE_M for line_m in lines):
+        bundle = replace(bundle, on_top=None)
     return bundle.with_cover_doubt(doubt)

@@ -7,6 +7,7 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -207,6 +208,7 @@ class DoubtKind(Enum):
     GAP = "a gap as deep as half its width"
     MAY_GO_ON = "it may be wider"
     NO_STRAPS = "no straps that hold it"
+    STRAPPED_BAR = "straps cross what looks like one bar"
     RIVAL = "explains the surface nearly as well"
     OTHER = ""
 
@@ -228,6 +230,12 @@ class Doubt:
         """Read a doubt back from a sentence in a file."""
         end = next((k for k, name in enumerate(ENDS) if f"the {name} end is open" in sentence), None)
         return cls(next(kind for kind in DoubtKind if kind.value in sentence), sentence, end)
+
+    @property
+    def along_m(self) -> float:
+        """Return where along the axis it lies that the doubt concerns, m from the middle, NaN if not told."""
+        told = re.search(r"([+-]\d+\.\d+) m from its middle", self.sentence)
+        return float(told[1]) if told else math.nan
 
 
 @dataclass(frozen=True, eq=False)
