@@ -11,6 +11,7 @@ from barsight.yard.bundles.fitting.ends import End, gap_rows, lost_rows
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.laid_objects import (
     StraightSections,
@@ -52,6 +53,10 @@ _BEFORE_END_M = 0.05
 _STUB_M, _HIDES_M, _MIN_LOST_M = 0.3, 0.05, 0.015
 """Lengths (m) along a bundle: that of what is too short to be another one at its end; maximum distance from
 what lies across it of the rows that this hides; minimum of a gap between two bundles.
+"""
+_MOST_CONFIDENT = 0.95
+"""Maximum confidence: the share of bundles told as free, with no doubt about that, that were free and lay as
+told on measured yards, irregular and spilled ones among them.
 """
 _SURE_KNOWN = 0.7
 """Minimum share of a bundle's length that must have been measured; below it, the bundle gets a doubt."""
@@ -256,14 +261,16 @@ def _bounds(reading: Reading) -> tuple[float, float]:
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:
     """Estimate the probability of a reading by the share of its length that agrees and by its lead over the
-    next different one.
+    next different one. One bar fits any crest: where a wider outline explains more, it is a part of that.
     """
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
     if rival is not None and abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
         lead = 1 - reading.rival_weight / max(reading.weight, 1e-9)
+        if fit.rings == 0 and lead < 0 and rival.fit.width_m > fit.width_m:
+            return DOUBTFUL * rate_agreement(rows)
     sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
-    return float(np.clip(sure * rate_agreement(rows), 0.01, 0.99))
+    return float(np.clip(sure * rate_agreement(rows), 0.01, _MOST_CONFIDENT))
 
 
 def rate_agreement(rows: UInt8) -> float:

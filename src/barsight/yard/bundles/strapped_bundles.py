@@ -63,6 +63,9 @@ def held_by_straps(
     if pack is None:
         return _without_straps(bundle, irregular, reading)
     held = _held(bundle, irregular, reading, seen, floor_m)
+    if held.bars is None and _is_top_bar(reading):
+        said = "straps cross what looks like one bar: it may be the top one of several"
+        held = replace(held, reasons=(*held.reasons, Doubt(DoubtKind.STRAPPED_BAR, said)))
     if held.bars is not None or not _may_go_on(pack, seen):
         return held
     said = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
@@ -70,6 +73,13 @@ def held_by_straps(
         held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan),
         reasons=(*held.reasons, Doubt(DoubtKind.MAY_GO_ON, said)),
     )  # fmt: skip
+
+
+def _is_top_bar(reading: Reading) -> bool:
+    """Check whether straps, which hold several bars, cross an outline of one bar without showing others."""
+    pack = reading.pack
+    one_bar = reading.found.fit.rings == 0 and pack is not None and math.isnan(pack.diameter_m)
+    return bool(one_bar and pack is not None and not pack.is_bounded)
 
 
 def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) -> Bundle:
@@ -95,19 +105,23 @@ def doubted_without_straps(bundle: Bundle) -> Bundle:
 
 
 def doubted_if_narrow(bundle: Bundle) -> Bundle:
-    """Mark as doubtful a bundle wider than one of its bars and narrower than two: it is a part of a wider
-    bundle, or one bar whose diameter is wrong. Its section isn't known.
+    """Mark as doubtful a bundle narrower than two of its bars, unless it may be one bar: it is a part of a
+    wider bundle, or one bar whose diameter is wrong. Straps hold no single bar. Its section isn't known.
     """
+    strapped = [doubt for doubt in bundle.reasons if doubt.kind is DoubtKind.STRAPPED_BAR]
     ratio = bundle.width_m / bundle.bar_diameter_m
-    if bundle.bars is not None or not _ONE_BAR < ratio < _TWO_BARS:
+    if bundle.bars is not None or (ratio <= _ONE_BAR and not strapped):
         return bundle
-    said = (
+    reasons = tuple(doubt for doubt in bundle.reasons if doubt not in strapped)
+    if ratio >= _TWO_BARS:
+        return replace(bundle, reasons=reasons) if strapped else bundle
+    narrow = (
         f"it is {1e3 * bundle.width_m:.0f} mm wide, less than two of its bars of "
         f"{1e3 * bundle.bar_diameter_m:.0f} mm: it may be wider, or one bar"
     )
+    doubts = strapped if ratio <= _ONE_BAR else [Doubt(DoubtKind.MAY_GO_ON, narrow)]
     return replace(
-        bundle, section_m2=np.nan, confidence=min(bundle.confidence, DOUBTFUL),
-        reasons=(*bundle.reasons, Doubt(DoubtKind.MAY_GO_ON, said)),
+        bundle, section_m2=np.nan, confidence=min(bundle.confidence, DOUBTFUL), reasons=(*reasons, *doubts),
         sigma=replace(bundle.sigma, section_m2=np.nan),
     )  # fmt: skip
 
