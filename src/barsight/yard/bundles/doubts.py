@@ -178,7 +178,7 @@ def list_wall_doubts(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[Doubt, ...]:
     """List the doubt that the bundle may be a wall: no flank falls off, or nothing carries it so high."""
-    if reading.is_flat:
+    if reading.is_flat or (reading.flanks is not None and reading.flanks.are_steps):
         return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
     if seen is None or floor_m is None:
         return ()

@@ -64,6 +64,14 @@ class Flanks:
         return self._doubt(_SURE_RATIO)
 
     @property
+    def are_steps(self) -> bool:
+        """Check whether neither flank falls off even as far as a map extends it, beside nothing higher. Round
+        bars show a flank there, whatever lines on top look like straps.
+        """
+        sides = zip(self.falls_m, self.rises_m, strict=True)
+        return all(fall < _FLAT_RATIO * self.width_m and rise <= _HIGHER_M for fall, rise in sides)
+
+    @property
     def unbounded(self) -> tuple[str, ...]:
         """Name the flanks beside which nothing was measured, so that the bundle may be wider."""
         return tuple(name for name, rise in zip(_SIDES, self.rises_m, strict=True) if np.isnan(rise))

@@ -1,4 +1,4 @@
-"""The top bar of a pack fits an outline of one bar: what tells that it is a part of more."""
+"""Outlines that fit what is no bundle: the top bar of a pack, a wall with lines on it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.yard.bundles.doubts import rate_confidence
+from barsight.yard.bundles.doubts import list_wall_doubts, rate_confidence
 from barsight.yard.bundles.fitting.outline import bundle_width
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.flanks import Flanks
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack
 from barsight.yard.bundles.section.straps import StrapSpan
@@ -64,6 +65,26 @@ def test_one_bar_of_what_a_wider_outline_explains_better_is_doubtful(
     wider = reading_of(2, rival_m).found
     reading = replace(reading_of(rings, 0.08), weight=1.0, rival=wider, rival_weight=weight)
     assert (rate_confidence(reading, reading.found.fit.state) >= 0.5) == is_sure
+
+
+@pytest.mark.parametrize(
+    ("falls_m", "rises_m", "is_wall"),
+    [
+        ((0.007, 0.010), (-np.inf, -0.004), True),
+        ((0.007, 0.030), (-np.inf, -0.004), False),
+        ((0.007, 0.010), (-np.inf, 0.05), False),
+        ((0.0, 0.010), (np.nan, -0.004), False),
+    ],
+)
+def test_straps_on_a_wall_make_no_bundle_of_it(
+    falls_m: tuple[float, float], rises_m: tuple[float, float], *, is_wall: bool
+) -> None:
+    """Two lines on a wall of 120 mm by 1.1 m looked like straps, and it was told as a free bundle. A flank
+    beside something higher, or beside which nothing was measured, shows nothing.
+    """
+    flanks = Flanks(0.12, falls_m, rises_m, are_flat=False, ended=(True, True))
+    doubts = list_wall_doubts(replace(reading_of(2, 0.12), flanks=flanks), None, 1.1, 0.0)
+    assert bool(doubts) == is_wall
 
 
 def reading_of(rings: int, width_m: float) -> Reading:
