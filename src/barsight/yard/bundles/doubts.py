@@ -54,7 +54,7 @@ _STUB_M, _HIDES_M, _MIN_LOST_M = 0.3, 0.05, 0.015
 """Lengths (m) along a bundle: that of what is too short to be another one at its end; maximum distance from
 what lies across it of the rows that this hides; minimum of a gap between two bundles.
 """
-_MOST_CONFIDENT = 0.95
+_MAX_CONFIDENCE = 0.95
 """Maximum confidence: the share of bundles told as free, with no doubt about that, that were free and lay as
 told on measured yards, irregular and spilled ones among them.
 """
@@ -270,7 +270,7 @@ def rate_confidence(reading: Reading, rows: UInt8) -> float:
         if fit.rings == 0 and lead < 0 and rival.fit.width_m > fit.width_m:
             return DOUBTFUL * rate_agreement(rows)
     sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
-    return float(np.clip(sure * rate_agreement(rows), 0.01, _MOST_CONFIDENT))
+    return float(np.clip(sure * rate_agreement(rows), 0.01, _MAX_CONFIDENCE))
 
 
 def rate_agreement(rows: UInt8) -> float:
