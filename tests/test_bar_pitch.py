@@ -110,6 +110,16 @@ def test_one_bar_keeps_its_diameter_unless_the_pitch_is_far_finer() -> None:
         assert kept or 1e3 * measured.bar_diameter_m == pytest.approx(bars_mm, rel=0.3)
 
 
+def test_a_pack_that_was_fitted_as_one_bar_is_measured_by_its_pitch() -> None:
+    """Straps and lines showed bars of 50 mm in what was fitted as one of 260 mm: it isn't one of those."""
+    pack = replace(told(0.05, 0.03), visible_bars=1)
+    poses = looking_down(0.0, 1)
+    for bars_mm in (25, 40):
+        pairs = Pictures(poses, striped(pack, bars_mm / 1e3))
+        (measured,) = measure_from_pictures(pairs, poses, flat_map(), (pack,))
+        assert 0.4 * bars_mm < 1e3 * min_diameter_m(measured) < bars_mm
+
+
 def test_what_no_picture_shows_is_left_as_told() -> None:
     bundle = told(0.11, 0.066)
     counted = replace(bundle, bars=7)

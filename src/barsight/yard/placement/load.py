@@ -27,6 +27,8 @@ MAX_TOP_RISE_M = 0.015
 """Maximum height (m), as a 95 % bound, of the load's own fitted top above the stated plane where that is
 lowest over it.
 """
+_ONE_BAR, _TWO_BARS = 1.5, 1.75
+"""Maximum width of what may be a single bar, in diameters: of any bundle, and of one that shows one bar."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +94,12 @@ def laid_at(load: tuple[Bundle, ...], x_m: float, y_m: float, yaw_rad: float) ->
 
 
 def is_one_bar(bundle: Bundle) -> bool:
-    """Check whether a bundle may be a single bar: one bar shows, or the bundle is hardly wider than one."""
-    return bundle.visible_bars == 1 or bundle.width_m < 1.5 * bundle.bar_diameter_m
+    """Check whether a bundle may be a single bar: it is hardly wider than one of its bars, or one bar shows
+    and it isn't as wide as two of them. A pack whose outline is one bar's may show thinner bars.
+    """
+    if bundle.visible_bars == 1:
+        return not bundle.width_m >= _TWO_BARS * bundle.bar_diameter_m
+    return bundle.width_m < _ONE_BAR * bundle.bar_diameter_m
 
 
 def reaches_area(
