@@ -25,6 +25,7 @@ from barsight.yard.bundles.fitting.outline_fit import Z as OUTLINE_Z
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
+from barsight.yard.bundles.irregular import widen_unended
 from barsight.yard.bundles.layers import list_overlaps
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.flanks import Flanks, _flank
@@ -42,6 +43,7 @@ from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.placement.load import Load
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 from barsight.yard.weight import bundle_mass
+from lift_yards import record
 from yard_maps import Laid, draw, photographed
 
 SETTINGS = BundleSettings()
@@ -476,6 +478,19 @@ def test_a_sheer_flank_is_seen_where_what_shows_behind_is_deeper_than_the_bundle
     level[(outwards > 0.175) & (outwards < 0.215)] = behind_m
     level[outwards > 0.215] = 0.1
     assert _flank(outwards, level, 0.0, 0.28) == (0.02, fall_m, rise_m)
+
+
+def test_a_side_that_nothing_shows_to_end_may_go_on() -> None:
+    """Two outlines that share a bundle miss each other's part: half a width, on one side each."""
+    nothing = Reading(cast(FittedOutline, None), 1.0, None, 0.0, None)
+    for falls_m, sides in (((0.1, 0.1), 0), ((0.02, 0.1), 1), ((0.02, 0.03), 2)):
+        flanks = Flanks(0.2, falls_m, (-np.inf, -np.inf), False)
+        assert replace(nothing, flanks=flanks).unended_sides == sides
+    bundle = record(Laid(0.0, 0.0, 0.2, 0.0))
+    for sides, off_m in ((0, 0.0), (1, bundle.width_m / 2), (2, bundle.width_m / 2)):
+        sigma = widen_unended(bundle, sides).sigma
+        side_m = float(np.hypot(sigma.lateral_m, sigma.width_m / 2))
+        assert off_m < 1.96 * side_m and (sides or side_m < 0.02)
 
 
 @pytest.mark.parametrize(("rise_m", "is_free"), [(-0.05, True), (0.15, False), (0.4, False)])

@@ -28,9 +28,9 @@ _SAME_M = 0.01
 """Maximum distance of a strap's end from the median at which it agrees with it."""
 _AGREE_RATIO = 0.5
 """Share of the lines' ends that must be exceeded by those that agree."""
-_FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.008, 0.004
-"""Sigma of a flank located by straps (at least one pixel); sigma of the centre of mass, taken as the middle
-between the flanks.
+_FLANK_SIGMA_M, _FLANK_PIXELS, _MIDDLE_SIGMA_M = 0.004, 0.5, 0.004
+"""Sigma of a flank located by straps, m and pixels (the larger one); sigma of the centre of mass, taken as
+the middle between the flanks.
 """
 _PLANE_RATIO = 0.25
 """Uncertainty of the height at which a bundle is widest, as a share of its width."""
@@ -224,7 +224,7 @@ def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
             best = same
     if best.sum() <= _AGREE_RATIO * ends_m.size:
         return None
-    spread = math.hypot(max(_FLANK_SIGMA_M, pixel_m), float(np.std(ends_m[best])))
+    spread = math.hypot(max(_FLANK_SIGMA_M, _FLANK_PIXELS * pixel_m), float(np.std(ends_m[best])))
     return _Flank(float(np.median(ends_m[best])), spread, float(along_m[best].mean()))
 
 

@@ -31,7 +31,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.floor import is_sunken
-from barsight.yard.bundles.irregular import widen_sigma, widen_unseen
+from barsight.yard.bundles.irregular import widen_sigma, widen_unended, widen_unseen
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
 from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
@@ -138,7 +138,8 @@ def make_bundle(
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
     held = held_by_straps(bundle, irregular, reading, seen, floor_m)
-    return widen_unseen(held, reading.flanks, settings.max_width_m)
+    unended = widen_unended(held, reading.unended_sides)
+    return widen_unseen(unended, reading.flanks, settings.max_width_m)
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:

@@ -4,6 +4,7 @@ are measured in part.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,22 @@ DIAMETER_RATIOS = 0.06, 0.45, 0.6
 """Errors of a diameter, as fractions of it: where bars show their shape, where they are too thin for that,
 and where another packing fits as well or many bars may look like one.
 """
+
+_UNENDED_RATIO = 0.4
+"""Error, in widths, of a side on which nothing shows where the bundle ends: it may be one of two outlines
+that share a bundle.
+"""
+
+
+def widen_unended(bundle: Bundle, sides: int) -> Bundle:
+    """Widen the sigma of a bundle by the number of sides on which nothing shows where it ends."""
+    off_m = _UNENDED_RATIO * math.sqrt(sides) * bundle.width_m
+    sigma = replace(
+        bundle.sigma,
+        width_m=math.hypot(bundle.sigma.width_m, off_m),
+        lateral_m=math.hypot(bundle.sigma.lateral_m, off_m / 2),
+    )
+    return replace(bundle, sigma=sigma) if sides else bundle
 
 
 def widen_unseen(bundle: Bundle, flanks: Flanks | None, max_width_m: float) -> Bundle:

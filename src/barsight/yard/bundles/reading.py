@@ -84,6 +84,15 @@ class Reading:
         )
 
     @property
+    def unended_sides(self) -> int:
+        """Count the sides on which neither straps nor a flank that falls off show where the bundle ends."""
+        sides = (PackSide.OPEN, PackSide.OPEN) if self.pack is None else self.pack.sides
+        falls = (False, False) if self.flanks is None else self.flanks.falls_off
+        return sum(
+            side is PackSide.OPEN and not falls_off for side, falls_off in zip(sides, falls, strict=True)
+        )
+
+    @property
     def is_flat(self) -> bool:
         """Check whether neither flank falls off, as on a plate or wall, and no straps bound it."""
         bounded = self.pack is not None and self.pack.is_bounded

@@ -27,6 +27,10 @@ _CREST_RATIO, _SMEARED_M = 0.6, 0.03
 """Minimum share of a pack's width over which straps must show to bound it: heaps of three rows extend beyond
 straps that only show on the top bar. Maximum width (m) that the map adds by smearing two flanks.
 """
+_BOTH_MIDDLE_M, _BOTH_WIDTH_RATIO = 0.004, 0.25
+"""Sigma of the middle of a pack and an outline that agree: absolute (m), and as a fraction of that of their
+width. Both flanks were found twice, so that hardly one of them alone is off.
+"""
 _SAME_MIDDLE_M = 0.009
 """Maximum distance (m) between the middles of a pack and of the outline that is fitted to it."""
 _CREST_M = 0.006
@@ -147,7 +151,8 @@ def _held(
         shown = reading.found.shades is not None
         if shown or abs(pack.middle_m) < _SAME_MIDDLE_M:
             own = replace(bundle, sigma=irregular)
-            return _covered(_confirmed(own, pack, floor_m, _pack_sigma(reading, pack)), pack)
+            sigmas_m = bundle.sigma.lateral_m, _pack_sigma(reading, pack)
+            return _covered(_confirmed(own, pack, floor_m, sigmas_m), pack)
     return _covered(_as_pack(bundle, irregular, reading, pack, floor_m), pack)
 
 
@@ -242,11 +247,16 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack, aside_m: fl
     return bundle
 
 
-def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
+def _confirmed(
+    bundle: Bundle, pack: Pack, floor_m: float | None, sigmas_m: tuple[float, float]
+) -> Bundle:  # fmt: skip
     """Keep a fitted outline that ends where the pack does. Its width is the mean of both, weighted by their
-    sigmas, and its sigma reflects how well they agree. The outline counts more where the pack's flanks are
-    out of sight.
+    sigmas, and its sigma reflects how well they agree, as that of its middle does. The outline counts more
+    where the pack's flanks are out of sight.
+
+    sigmas_m: of the fit's place, and of the pack's width.
     """
+    fitted_m, pack_sigma_m = sigmas_m
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > SAME_DIAMETER_RATIO * diameter:
         diameter, spread = pack.diameter_m, _LINES_SIGMA_RATIO * pack.diameter_m
@@ -257,7 +267,7 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
-        lateral_m=math.hypot(bundle.sigma.lateral_m, pack.middle_m),
+        lateral_m=math.hypot(fitted_m, pack.middle_m, _BOTH_MIDDLE_M, _BOTH_WIDTH_RATIO * width_sigma),
         width_m=width_sigma,
         section_m2=section_sigma,
     )

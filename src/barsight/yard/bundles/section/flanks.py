@@ -76,6 +76,12 @@ class Flanks:
         """Name the flanks beside which nothing was measured, so that the bundle may be wider."""
         return tuple(name for name, rise in zip(_SIDES, self.rises_m, strict=True) if np.isnan(rise))
 
+    @property
+    def falls_off(self) -> tuple[bool, bool]:
+        """Check on the low and the high side whether the surface certainly falls off before its edge."""
+        low, high = (fall >= _SURE_RATIO * self.width_m for fall in self.falls_m)
+        return low, high
+
     def _doubt(self, shallow_ratio: float) -> Doubt | None:
         sides = list(zip(_SIDES, self.falls_m, self.rises_m, self.ended, strict=True))
         for name, fall, rise, ended in sides:
