@@ -80,8 +80,8 @@ def test_flanks_stand_where_straps_end(yaw_deg: float, gray: float) -> None:
     assert one.width_m == pytest.approx(high - low, abs=0.008)
     assert middle_m(one) == pytest.approx((low + high) / 2, abs=0.006)
     np.testing.assert_allclose(one.ends_m.mean(axis=0), one.centre_m, atol=1e-9)
-    # Half of what they are off the map's flanks, 10 and 70 mm, adds to the sigma.
-    assert 0.034 < one.sigma.width_m < 0.04 and one.sigma.lateral_m < 0.021
+    # 0.6 of what they are off the map's flanks, 10 and 70 mm, adds to the sigma.
+    assert 0.034 < one.sigma.width_m < 0.046 and one.sigma.lateral_m < 0.024
     assert 0.4 < one.section_m2 / (high - low) ** 2 < 0.8 and one.sigma.section_m2 > 0
 
 
@@ -165,9 +165,10 @@ def test_flanks_take_no_other_bundle_in() -> None:
 
 
 def test_sigma_grows_with_the_pixel_and_the_slope_of_the_view() -> None:
-    """Straps end where the map has the flanks; elsewhere half of what they differ adds to it."""
+    """Straps end where the map has the flanks; elsewhere 0.6 of what they differ adds to it."""
     bundle, seen = told(7.0), section(-0.13, 0.13)
     near = with_flanks(bundle, ends(-0.13, 0.13), seen, 0.0, 0.0)
+    assert 0.005 < near.sigma.width_m < 0.008  # Drawn packs are 4.6 mm off (rms).
     coarse = [end._replace(pixel_m=0.02) for end in ends(-0.13, 0.13)]
     assert with_flanks(bundle, coarse, seen, 0.0, 0.0).sigma.width_m > 2 * near.sigma.width_m
     assert with_flanks(bundle, ends(-0.13, 0.13), seen, 0.0, 0.4).sigma.width_m > 2 * near.sigma.width_m

@@ -28,9 +28,9 @@ _SAME_M = 0.01
 """Maximum distance of a strap's end from the median at which it agrees with it."""
 _AGREE_RATIO = 0.5
 """Share of the lines' ends that must be exceeded by those that agree."""
-_FLANK_SIGMA_M, _FLANK_PIXELS, _MIDDLE_SIGMA_M = 0.004, 0.5, 0.004
-"""Sigma of a flank located by straps, m and pixels (the larger one); sigma of the centre of mass, taken as
-the middle between the flanks.
+_FLANK_SIGMA_M, _FLANK_PIXELS, _MOVED_RATIO, _MIDDLE_SIGMA_M = 0.004, 0.5, 0.6, 0.004
+"""Sigma of a flank located by straps, m and pixels (the larger one), and as a share of its distance from the
+map's flank; sigma of the centre of mass, taken as the middle between the flanks.
 """
 _PLANE_RATIO = 0.25
 """Uncertainty of the height at which a bundle is widest, as a share of its width."""
@@ -160,8 +160,8 @@ def with_flanks(
     if off.max() > _CONTRADICTED or abs(middle) > _MAX_ASIDE_M:
         return _contradicted(bundle, middle, width)
     plane_m = tilt * _PLANE_RATIO * width
-    moved = abs(low + bundle.width_m / 2) / 2, abs(high - bundle.width_m / 2) / 2
-    spread = math.hypot(*(flank.sigma_m for flank in flanks), *moved, plane_m)
+    moved_m = _MOVED_RATIO * math.hypot(low + bundle.width_m / 2, high - bundle.width_m / 2)
+    spread = math.hypot(*(flank.sigma_m for flank in flanks), moved_m, plane_m)
     turned = own.yaw_rad * max(abs(flank.along_m) for flank in flanks)
     sigma = replace(own, width_m=spread, lateral_m=math.hypot(spread / 2, _MIDDLE_SIGMA_M, plane_m, turned))
     if not any(doubt.kind is DoubtKind.MAY_GO_ON for doubt in bundle.reasons):

@@ -138,8 +138,7 @@ def make_bundle(
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
     held = held_by_straps(bundle, irregular, reading, seen, floor_m)
-    unended = widen_unended(held, reading.unended_sides)
-    return widen_unseen(unended, reading.flanks, settings.max_width_m)
+    return widen_unseen(widen_unended(held, reading.unended_sides), reading.flanks, settings.max_width_m)
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:
