@@ -63,14 +63,17 @@ def test_a_bundle_that_sags_between_its_timbers_has_no_bar_on_it(bar_m: float | 
     assert found.length_m > 5.8
 
 
+VIEWS = np.full((200, 25), 5.0)
+
+
 def test_a_ridge_over_the_fitted_outline_lies_along_whatever_the_straps_bound() -> None:
     """A pack's top, which straps bound, holds the bar."""
     beside = 0.01 * np.arange(25) - 0.12
     z = np.tile(np.where(np.abs(beside) < 0.025, 0.27, 0.24), (200, 1))
     sure = np.zeros_like(z)
     rises = (pytest.approx(0.03), pytest.approx(0.03))
-    assert measure_along(StraightSections(z, sure, 0.15, 0.24, 0.24, 0.01)) == rises
-    assert measure_along(StraightSections(z, sure, 0.15, 0.27, 0.24, 0.01)) == (0.0, 0.0)
+    assert measure_along(StraightSections(z, sure, VIEWS, 0.15, 0.24, 0.24, 0.01)) == rises
+    assert measure_along(StraightSections(z, sure, VIEWS, 0.15, 0.27, 0.24, 0.01)) == (0.0, 0.0)
 
 
 def test_what_a_map_is_unsure_of_only_may_lie_along() -> None:
@@ -81,7 +84,7 @@ def test_what_a_map_is_unsure_of_only_may_lie_along() -> None:
     for unsure_m, sure in ((0.005, 0.025), (0.02, 0.01)):
         unsure = np.where(z > 0.25, unsure_m, 0.0)
         rises = (pytest.approx(0.03), pytest.approx(sure))
-        assert measure_along(StraightSections(z, unsure, 0.15, 0.24, 0.24, 0.01)) == rises
+        assert measure_along(StraightSections(z, unsure, VIEWS, 0.15, 0.24, 0.24, 0.01)) == rises
 
 
 @pytest.mark.parametrize(("unsure_m", "is_clear"), [(0.01, True), (0.025, False)])
@@ -90,7 +93,7 @@ def test_what_a_map_is_unsure_of_only_may_lie_on_a_bundle(unsure_m: float, *, is
     z = np.full((200, 25), 0.24)
     z[80:90, 20:24] = 0.28
     unsure = np.where(z > 0.25, unsure_m, 0.0)
-    laid = measure_laid(StraightSections(z, unsure, 0.12, 0.24, 0.24, 0.01))
+    laid = measure_laid(StraightSections(z, unsure, VIEWS, 0.12, 0.24, 0.24, 0.01))
     assert laid == (pytest.approx(0.04), is_clear)
 
 

@@ -335,7 +335,9 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
     assert bundle.is_free is is_free
 
 
-def _reading_of(z_m: Float64, width_m: float, *, pack_only: bool = False) -> Reading:
+def _reading_of(
+    z_m: Float64, width_m: float, *, pack_only: bool = False, views: Float64 | None = None
+) -> Reading:
     """Describe a bundle by its heights, its top at 0.24 m. pack_only: the fit has the topmost bar alone."""
     fitted_m = width_m / 4 if pack_only else width_m
     values = np.zeros(6)
@@ -344,8 +346,9 @@ def _reading_of(z_m: Float64, width_m: float, *, pack_only: bool = False) -> Rea
     pack = SimpleNamespace(
         is_bounded=True, low_m=-width_m / 2, high_m=width_m / 2, width_m=width_m, top_m=fitted_m / 2
     )
+    views = np.full_like(z_m, 5) if views is None else views
     grid = SimpleNamespace(
-        z_m=z_m, sigma_m=np.full_like(z_m, 0.003), cell_m=0.01, u0_m=-width_m / 2, v0_m=-1.0
+        z_m=z_m, sigma_m=np.full_like(z_m, 0.003), views=views, cell_m=0.01, u0_m=-width_m / 2, v0_m=-1.0
     )
     reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=pack if pack_only else None)
     return cast(Reading, reading)
@@ -413,6 +416,24 @@ def test_what_lies_on_a_bundle_is_found_though_matching_loses_its_edge(lost: int
     for row in range(80, 86):
         z[row, 20 + row % 2 : 20 + lost] = np.nan
     assert (measure_laid(straighten(_reading_of(z, 0.24)))[0] > 0) is is_found
+
+
+@pytest.mark.parametrize(
+    ("views", "row_views", "clear"), [(4, 10, False), (4, 4, False), (7, 10, True), (np.inf, 10, True)]
+)
+def test_a_flank_that_few_views_tell_is_not_clearly_another_thing(
+    views: float, row_views: float, *, clear: bool
+) -> None:
+    """Over 0.1 m the last 30 mm of a flank lie 45 mm too high. Of ten views some tell these rows, of those
+    some tell the flank; or the laser does.
+    """
+    u = 0.01 * np.arange(25) - 0.12
+    z = np.tile(0.24 - np.maximum(np.abs(u) - 0.03, 0.0), (200, 1))
+    told = np.full_like(z, 10)
+    z[80:90, -3:] += 0.045
+    told[80:90] = row_views
+    told[80:90, -3:] = views
+    assert measure_laid(straighten(_reading_of(z, 0.24, views=told))) == (pytest.approx(0.045), clear)
 
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:
@@ -639,7 +660,7 @@ def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves
     u = cell * np.arange(-30, 31)
     level = np.where(np.abs(u) > 0.08, 0.43, 0.5 - deep_m * (u / 0.08) ** 2)
     z = np.tile(level.astype(np.float32), (40, 1))
-    grid = AlignedMap(0.0, float(u[0]), 0.0, cell, z, np.full_like(z, 0.003), 0.05)
+    grid = AlignedMap(0.0, float(u[0]), 0.0, cell, z, np.full_like(z, 0.003), np.full_like(z, 5), 0.05)
     fits = [
         Fit(
             TRIANGLE, 0.2, np.array([at, 0.0, 0.42, 0.0, 0.0, diameter]), np.zeros((6, 6)), 0, 39,
@@ -659,7 +680,7 @@ def test_what_is_out_of_sight_beside_a_section_makes_it_unsure() -> None:
     sights = []
     for hidden in (np.zeros(61, bool), ((u < -0.085) & (u > -0.125)) | ((u > 0.085) & (u < 0.155))):
         z = np.tile(np.where(hidden, np.nan, level).astype(np.float32), (40, 1))
-        grid = AlignedMap(0.0, float(u[0]), 0.0, 0.01, z, np.full_like(z, 0.003), 0.05)
+        grid = AlignedMap(0.0, float(u[0]), 0.0, 0.01, z, np.full_like(z, 0.003), np.full_like(z, 5), 0.05)
         values = np.array([0.0, 0.0, 0.42, 0.0, 0.0, 0.17 / bundle_width(1, 1.0)])
         state, gain = np.full(40, AGREES, np.uint8), np.ones(40, np.float32)
         fit = Fit(1, 0.2, values, np.zeros((6, 6)), 0, 39, state, gain, 0.0, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -233,7 +235,7 @@ def test_a_turned_sheet_holds_the_nearest_measured_cells() -> None:
     rng = np.random.default_rng(8)
     z = rng.normal(size=(31, 22)).astype(np.float32)
     source = rng.choice([0, 1, 1, 1, 3], z.shape).astype(np.uint8)
-    heights = HeightMap(-0.4, 2.1, 0.01, z, z + 1, np.ones_like(z), source)
+    heights = HeightMap(-0.4, 2.1, 0.01, z, z + 1, z + 2, source)
     grid = align_map(heights, 0.4)
     row, column = np.indices(grid.z_m.shape)
     uv = np.column_stack([grid.u0_m + 0.01 * column.ravel(), grid.v0_m + 0.01 * row.ravel()])
@@ -244,6 +246,9 @@ def test_a_turned_sheet_holds_the_nearest_measured_cells() -> None:
     measured = inside & (source[i, j] == HeightSource.VISION)
     np.testing.assert_array_equal(grid.z_m.ravel(), np.where(measured, z[i, j], np.float32(np.nan)))
     np.testing.assert_array_equal(grid.sigma_m.ravel(), np.where(measured, z[i, j] + 1, np.float32(np.nan)))
+    np.testing.assert_array_equal(grid.views.ravel(), np.where(measured, z[i, j] + 2, np.float32(np.nan)))
+    later = align_map(replace(heights, passes=source), 0.4)
+    np.testing.assert_array_equal(later.views.ravel(), np.where(measured, np.inf, np.nan))
     assert 200 < measured.sum() < inside.sum() < inside.size
 
 

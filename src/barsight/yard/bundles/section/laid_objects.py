@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.fitting.outline_fit import SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
@@ -18,6 +18,11 @@ _LAID_CELLS = 2
 """Minimum size of such an object in cells: a steep flank is often off by one."""
 _MIN_SEEN_RATIO = 0.75
 """Minimum share of such an object's places that is measured: matching loses places along its edges."""
+_MIN_VIEWS_RATIO = 0.6
+"""Minimum number of views that tell a place of such an object, as a share of the median of its row's and of
+the bundle's. Matching smooths a flank over what lies beside it where a view sees it fall away: in its row the
+other views contradict; beside the pictures' borders there may be no others.
+"""
 _MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
 """Range of a bundle's bow, in cells between its middle and its ends; cost of each, m of mean misfit; step of
 the rows by which it is found.
@@ -45,12 +50,14 @@ class StraightSections:
     """The heights (R, C) of a bundle's rows from flank to flank, less the rise along its axis, NaN where
     unknown. The rows of a bowed bundle are shifted sideways into line.
 
-    unsure_m: by how much each height's sigma exceeds the bundle's median one. axis_z_m: height of its axis.
+    unsure_m: by how much each height's sigma exceeds the bundle's median one. views: (R, C), how many tell a
+    height, inf where that isn't known. axis_z_m: height of its axis.
     outline_z_m: that of the fitted outline's top.
     """
 
     z_m: Float64
     unsure_m: Float64
+    views: Float64
     axis_z_m: float
     outline_z_m: float
     width_m: float
@@ -80,42 +87,42 @@ def straight_sections(
         cost = float(np.nanmean(misfit)) + _BOW_COST_M * abs(bow) if np.isfinite(misfit).any() else np.inf
         if cost < least:
             best, least = bow, cost
-    z = look_up(grid, fit, rows, beside + best * parabola)
-    _, column, inside = _cells(grid, fit, rows, beside + best * parabola)
-    sigma = np.where(inside, grid.sigma_m[rows[:, None], column], np.nan)
+    beside = beside + best * parabola
+    z, views = look_up(grid, fit, rows, beside), _read_rows(grid, grid.views, fit, rows, beside)
+    sigma = _read_rows(grid, grid.sigma_m, fit, rows, beside)
     unsure = np.maximum(sigma - np.nanmedian(sigma), 0) if np.isfinite(sigma).any() else np.zeros_like(z)
     outline_z_m = float(fit.values[Z]) + fit.width_m / 2
-    return StraightSections(z, unsure, axis_z_m, outline_z_m, high_m - low_m, grid.cell_m)
+    return StraightSections(z, unsure, views, axis_z_m, outline_z_m, high_m - low_m, grid.cell_m)
 
 
 def look_up(grid: AlignedMap, fit: Fit, rows: Int64, beside: Float64) -> Float64:
     """Look up the heights (R, C) of a bundle's rows at places beside its axis, (C,) or (R, C), less the rise
     along it; NaN where unknown.
     """
-    along, column, inside = _cells(grid, fit, rows, beside)
-    z = grid.z_m[rows[:, None], column]
-    return np.where(inside, z - fit.values[SLOPE_Z] * along, np.nan)
+    along = grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m
+    z: Float64 = _read_rows(grid, grid.z_m, fit, rows, beside) - fit.values[SLOPE_Z] * along
+    return z
 
 
-def _cells(grid: AlignedMap, fit: Fit, rows: Int64, beside: Float64) -> tuple[Float64, Int64, Bool]:
-    """Find a bundle's rows' places along (R, 1), their columns (R, C) at places beside its axis, and whether
-    the map has these.
-    """
-    along = np.asarray(grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m, np.float64)
+def _read_rows(grid: AlignedMap, told: Float32, fit: Fit, rows: Int64, beside: Float64) -> Float64:
+    """Read an array [v, u] of the map at a bundle's rows and places beside its axis, NaN outside."""
+    along = grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m
     column = np.rint((fit.values[U] + fit.values[SLOPE_U] * along + beside - grid.u0_m) / grid.cell_m)
-    inside = (column >= 0) & (column < grid.z_m.shape[1])
-    return along, np.where(inside, column, 0).astype(np.int64), inside
+    inside = (column >= 0) & (column < told.shape[1])
+    read: Float64 = told[rows[:, None], np.where(inside, column, 0).astype(np.int64)].astype(np.float64)
+    return np.where(inside, read, np.nan)
 
 
 def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
     does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
-    the section is shifted sideways by a cell, and where its heights are unsure, even if these are too high.
+    the section is shifted sideways by a cell, and where its heights are unsure, even if these are too high;
+    where fewer views tell it than the rest of the bundle it doesn't count.
 
     Rises are measured over the bundle's own section. An object is a patch that everywhere holds a rectangle
     of _LAID_SIZE_M and rises by _LAID_M. An object no higher than the axis, where a gully shows at the rim,
     lies beside the bundle, as dunnage does. A steep flank that is off by a cell rises as much; an object on a
-    bundle rests on its crest and rises over the shifted section too.
+    bundle rests on its crest and rises over the shifted section too, and nearly all views see it.
     """
     if sections is None:
         return 0.0, False
@@ -123,13 +130,26 @@ def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     sunken = (own < sections.axis_z_m - _GULLY_RATIO * sections.width_m)[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
     rises = np.isfinite(z) & ~(gully & (z < sections.axis_z_m)) & (z - own > _LAID_M)
+    views = sections.views
+    most = np.fmax(known_median(views.T).T, known_median(views.reshape(-1, 1)))
+    laid, told = (
+        _laid_patches(sections, part) for part in (rises, rises & (views >= _MIN_VIEWS_RATIO * most))
+    )
+    clear = told & (z - sections.unsure_m - _shifted(own) > _LAID_M)
+    return float((z - own)[laid].max(initial=0.0)), bool(clear.any())
+
+
+def _laid_patches(sections: StraightSections, rises: Bool) -> Bool:
+    """Mark the places (R, C) of `rises` in patches that everywhere hold a rectangle of _LAID_SIZE_M; part of
+    each may be unknown.
+    """
     size = [max(round(side / sections.cell_m), _LAID_CELLS) for side in _LAID_SIZE_M]
     square = np.ones(size, bool)
     seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
-    fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
-    laid = ndimage.binary_dilation(fits, square) & rises
-    clear = z - sections.unsure_m - _shifted(own) > _LAID_M
-    return float((z - own)[laid].max(initial=0.0)), bool(clear[laid].any())
+    unknown = np.isnan(sections.z_m)
+    fits = ndimage.binary_erosion(rises | unknown, square) & (seen > _MIN_SEEN_RATIO - 1e-6)
+    marked: Bool = ndimage.binary_dilation(fits, square) & rises
+    return marked
 
 
 def measure_along(sections: StraightSections | None) -> tuple[float, float]:
