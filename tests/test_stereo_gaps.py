@@ -67,16 +67,38 @@ def test_an_edge_along_the_rows_is_no_streak() -> None:
     assert not streak_mask(image).any()
 
 
-def test_bars_along_the_rows_in_pieces_are_unknown_and_whole_ones_stay() -> None:
-    image = streaked(along_rows=True)
-    known = np.full(image.shape, 20, np.float32)
+def in_pieces(scatter_px: float) -> np.ndarray:
+    """Disparity of the picture with a quarter of the pixels along some of its bars unmatched and the others
+    scattered.
+    """
+    known = np.full((240, 400), 20, np.float32)
+    known[120:150] += np.random.default_rng(4).normal(0, scatter_px, (30, 400)).astype(np.float32)
     known[120:150, 100:300:8], known[120:150, 101:300:8] = np.nan, np.nan
+    return known
+
+
+def test_bars_along_the_rows_in_scattered_pieces_are_unknown_and_whole_ones_stay() -> None:
+    image, known = streaked(along_rows=True), in_pieces(0.6)
     pieces = Disparity(known, known * 0 + 0.1, 0.05)
     kept = np.isfinite(mask_pieces(pieces, image).disparity_px)
     assert not kept[122:148, 150:250].any()
     assert kept[80:118, 70:330].all()
     across = mask_pieces(pieces, streaked(along_rows=False))
     assert (np.isfinite(across.disparity_px) == np.isfinite(known)).all()
+
+
+def test_a_highlight_matched_behind_its_bar_is_unknown() -> None:
+    known = in_pieces(0.05)
+    known[120:150, 180:220] -= 4
+    kept = np.isfinite(mask_pieces(Disparity(known, known * 0 + 0.1), streaked(along_rows=True)).disparity_px)
+    assert not kept[122:148, 165:195].any() and not kept[122:148, 205:235].any()
+
+
+def test_pieces_at_one_disparity_stay() -> None:
+    """Such as the floor and flanks in shadow beside bars along the rows."""
+    known = in_pieces(0.1) + np.float32(70)
+    kept = np.isfinite(mask_pieces(Disparity(known, known * 0 + 0.1), streaked(along_rows=True)).disparity_px)
+    assert (kept == np.isfinite(known)).all()
 
 
 def test_what_is_kept_keeps_its_bits() -> None:

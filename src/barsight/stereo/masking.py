@@ -7,8 +7,9 @@ perfectly at that surface's disparity, since both edges do, but nothing is there
 Where bars lie along the rows, as the baseline does, little distinguishes one place of a bar from the next. On
 shiny steel it is mostly a lamp's highlight, which has no fixed position: it matches half a metre off in one
 piece and not at all in the next, and no other view contradicts it since the highlight moves with the crane.
-The sigma of such a match is no guide, but the holes beside it are: a true surface is matched all along its
-bars.
+The sigma of such a match is no guide, but the holes beside it are, together with the scatter of the matches
+around it: a true surface is matched all along its bars or, in shadow and beside flanks, at one disparity in
+what is matched.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ _MAX_SLOPE_RATIO = 0.35
 streaks.
 """
 _MIN_MATCHED_RATIO = 0.85
+_BESIDE_PX, _MAX_SCATTER_PX = (41, 3), 0.3
+"""Size of the window in which matches scatter, and maximum standard deviation of those of one surface."""
 
 
 def gap_mask(image: UInt8, darkness: float) -> Bool:
@@ -56,13 +59,32 @@ def mask_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Disparity:
 
 
 def mask_pieces(disparity: Disparity, image: UInt8) -> Disparity:
-    """Mask bars along the rows where less than 85 % of the pixels along them are matched."""
+    """Mask bars along the rows where less than 85 % of the pixels along them are matched, unless those that
+    are matched lie at one disparity.
+    """
     streaks = streak_mask(image)
     if not streaks.any():
         return disparity
     known = np.isfinite(disparity.disparity_px)
     matched = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, _ALONG_PX)
-    return mask_disparity(disparity, ~(streaks & (matched < _MIN_MATCHED_RATIO)))
+    pieces = streaks & known & (matched < _MIN_MATCHED_RATIO)
+    if not pieces.any():
+        return disparity
+    scatter = _scatter_px(disparity.disparity_px, known)
+    return mask_disparity(disparity, ~(pieces & (scatter > _MAX_SCATTER_PX)))
+
+
+def _scatter_px(disparity: Float32, known: Bool) -> Float32:
+    """Compute the standard deviation (H, W), px, of the known disparities in windows along the rows."""
+    # Without their common part the squares keep their digits.
+    off = np.where(known, disparity - disparity[known].mean(), np.float32(0))
+    share, mean, square = (
+        cv2.boxFilter(values, cv2.CV_32F, _BESIDE_PX) for values in (known.astype(np.float32), off, off * off)
+    )
+    np.maximum(share, np.float32(1e-3), out=share)
+    mean /= share
+    scatter: Float32 = np.sqrt(np.maximum(square / share - mean * mean, np.float32(0)))
+    return scatter
 
 
 def streak_mask(image: UInt8) -> Bool:
