@@ -67,38 +67,43 @@ def test_an_edge_along_the_rows_is_no_streak() -> None:
     assert not streak_mask(image).any()
 
 
-def in_pieces(scatter_px: float) -> np.ndarray:
-    """Disparity of the picture with a quarter of the pixels along some of its bars unmatched and the others
-    scattered.
+def in_pieces(scatter_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """The picture with some of its bars in shadow, and a disparity that is scattered there and has gaps on a
+    quarter of the pixels.
     """
-    known = np.full((240, 400), 20, np.float32)
+    image, known = streaked(along_rows=True), np.full((240, 400), 90, np.float32)
+    image[120:150] = 0.4 * image[120:150]
     known[120:150] += np.random.default_rng(4).normal(0, scatter_px, (30, 400)).astype(np.float32)
     known[120:150, 100:300:8], known[120:150, 101:300:8] = np.nan, np.nan
-    return known
+    return image, known
 
 
-def test_bars_along_the_rows_in_scattered_pieces_are_unknown_and_whole_ones_stay() -> None:
-    image, known = streaked(along_rows=True), in_pieces(0.6)
-    pieces = Disparity(known, known * 0 + 0.1, 0.05)
-    kept = np.isfinite(mask_pieces(pieces, image).disparity_px)
+def kept_pieces(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    return np.isfinite(mask_pieces(Disparity(known, known * 0 + 0.1, 0.05), image).disparity_px)
+
+
+def test_bars_along_the_rows_in_pieces_are_unknown_and_whole_ones_stay() -> None:
+    image, known = in_pieces(0.6)
+    kept = kept_pieces(image, known)
     assert not kept[122:148, 150:250].any()
     assert kept[80:118, 70:330].all()
-    across = mask_pieces(pieces, streaked(along_rows=False))
-    assert (np.isfinite(across.disparity_px) == np.isfinite(known)).all()
+    assert (kept_pieces(streaked(along_rows=False), known) == np.isfinite(known)).all()
 
 
-def test_a_highlight_matched_behind_its_bar_is_unknown() -> None:
-    known = in_pieces(0.05)
+def test_dark_pieces_at_one_disparity_stay_and_bright_ones_are_unknown() -> None:
+    """In the shadow of a flank the floor is matched in places; a highlight shines."""
+    image, known = in_pieces(0.1)
+    matched = np.isfinite(known)
+    assert (kept_pieces(image, known) == matched)[122:148].all()
+    crests = np.arange(126, 148, 5)
+    assert not kept_pieces(streaked(along_rows=True), known)[crests, 150:250].any()
+
+
+def test_a_dark_piece_matched_behind_its_bar_is_unknown() -> None:
+    image, known = in_pieces(0.05)
     known[120:150, 180:220] -= 4
-    kept = np.isfinite(mask_pieces(Disparity(known, known * 0 + 0.1), streaked(along_rows=True)).disparity_px)
+    kept = kept_pieces(image, known)
     assert not kept[122:148, 165:195].any() and not kept[122:148, 205:235].any()
-
-
-def test_pieces_at_one_disparity_stay() -> None:
-    """Such as the floor and flanks in shadow beside bars along the rows."""
-    known = in_pieces(0.1) + np.float32(70)
-    kept = np.isfinite(mask_pieces(Disparity(known, known * 0 + 0.1), streaked(along_rows=True)).disparity_px)
-    assert (kept == np.isfinite(known)).all()
 
 
 def test_what_is_kept_keeps_its_bits() -> None:

@@ -7,9 +7,9 @@ perfectly at that surface's disparity, since both edges do, but nothing is there
 Where bars lie along the rows, as the baseline does, little distinguishes one place of a bar from the next. On
 shiny steel it is mostly a lamp's highlight, which has no fixed position: it matches half a metre off in one
 piece and not at all in the next, and no other view contradicts it since the highlight moves with the crane.
-The sigma of such a match is no guide, but the holes beside it are, together with the scatter of the matches
-around it: a true surface is matched all along its bars or, in shadow and beside flanks, at one disparity in
-what is matched.
+The sigma of such a match is no guide, but the holes beside it are: a true surface is matched all along its
+bars. So is the floor beside them, but in a flank's shadow only in places; what is dark there, and lies at one
+disparity, is no highlight.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ streaks.
 _MIN_MATCHED_RATIO = 0.85
 _BESIDE_PX, _MAX_SCATTER_PX = (41, 3), 0.3
 """Size of the window in which matches scatter, and maximum standard deviation of those of one surface."""
+_MAX_DULL_RATIO = 0.8
+"""Maximum ratio of the brightness of what is no highlight to that of all bars along the rows."""
 
 
 def gap_mask(image: UInt8, darkness: float) -> Bool:
@@ -59,8 +61,8 @@ def mask_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Disparity:
 
 
 def mask_pieces(disparity: Disparity, image: UInt8) -> Disparity:
-    """Mask bars along the rows where less than 85 % of the pixels along them are matched, unless those that
-    are matched lie at one disparity.
+    """Mask bars along the rows where less than 85 % of the pixels along them are matched, unless these are
+    dark and lie at one disparity.
     """
     streaks = streak_mask(image)
     if not streaks.any():
@@ -70,8 +72,9 @@ def mask_pieces(disparity: Disparity, image: UInt8) -> Disparity:
     pieces = streaks & known & (matched < _MIN_MATCHED_RATIO)
     if not pieces.any():
         return disparity
-    scatter = _scatter_px(disparity.disparity_px, known)
-    return mask_disparity(disparity, ~(pieces & (scatter > _MAX_SCATTER_PX)))
+    dull = cv2.blur(image, (3, 3)) < _MAX_DULL_RATIO * image[streaks].mean()
+    level = _scatter_px(disparity.disparity_px, known) <= _MAX_SCATTER_PX
+    return mask_disparity(disparity, ~pieces | (dull & level))
 
 
 def _scatter_px(disparity: Float32, known: Bool) -> Float32:
