@@ -99,7 +99,9 @@ def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
 
 
 def nearest_to_limit(checks: Iterable[Check]) -> Check:
-    """Take, of one check made in several ways, the one that failed, else the one nearest to its limit."""
+    """Take, of one check made in several ways, the one that failed, else the one whose 95 % bound is nearest
+    to its limit.
+    """
 
     def margin(check: Check) -> float:
         if check.result != "passed":
