@@ -10,7 +10,7 @@ import pytest
 
 from barsight.bundle_pictures.told_straps import tell_straps
 from barsight.yard.thin_lines import SURE_STRENGTH, find_thin_lines, with_thin_lines
-from barsight.yard.types import Bundle, DoubtKind, HeightMap
+from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 from drawn_pictures import TOP_M, Pictures, flat_map, looking_down
 from lift_yards import record
 from yard_maps import Laid
@@ -86,3 +86,13 @@ def test_a_line_beside_a_told_strap_is_still_found() -> None:
         lines = find_thin_lines(heights, replace(bundle, straps_m=(at_m,)))
         assert lines is not None and lines[0].strength < SURE_STRENGTH
         assert (lines[0].excess_ratio >= 1) is is_found
+
+
+def test_a_told_strap_leaves_in_doubt_what_may_lie_along() -> None:
+    """The map rises along it, where it is unsure: no line's place is told, and a strap says nothing of it."""
+    shade = crossed(0.032, -WIDTH_M / 2, WIDTH_M / 2, is_round=False)
+    heights, bundle = photographed(shade)
+    along = Doubt(DoubtKind.FAINT_LINE, "along it the map rises by 25 mm: a thin bar may lie over it")
+    bundle = replace(bundle, cover_doubts=(along, *bundle.cover_doubts))
+    (told,) = tell_straps(Pictures(POSES, shade), POSES, heights, (bundle,))
+    assert told.straps_m and told.cover_doubts == (along,) and not told.is_free

@@ -124,13 +124,15 @@ def tell_straps(
 
 
 def _with_straps(bundle: Bundle, told_m: tuple[float, ...], heights: YardMap) -> Bundle:
-    """Return the bundle with these straps, without the doubt that they raised if no other line is left."""
+    """Return the bundle with these straps, without the doubt that they raised if no other line is left. A
+    thin bar that may lie along it, of which no place is told, stays in doubt.
+    """
     bundle = replace(bundle, straps_m=told_m)
     left = find_thin_lines(_part(heights, bundle), bundle)
     if left is None or left[0].excess_ratio >= 1:
         return bundle
     reasons, covers = (
-        tuple(doubt for doubt in doubts if doubt.kind is not DoubtKind.FAINT_LINE)
+        tuple(one for one in doubts if one.kind is not DoubtKind.FAINT_LINE or math.isnan(one.along_m))
         for doubts in (bundle.reasons, bundle.cover_doubts)
     )
     return replace(bundle, reasons=reasons, cover_doubts=covers)
