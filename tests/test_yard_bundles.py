@@ -501,6 +501,15 @@ def test_a_sheer_flank_is_seen_where_what_shows_behind_is_deeper_than_the_bundle
     assert _flank(outwards, level, 0.0, 0.28) == (0.02, fall_m, rise_m)
 
 
+@pytest.mark.parametrize("rise_m", [-0.02, 0.0, 0.01, 0.08])
+def test_a_bar_along_a_flank_hides_it_where_floor_shows_just_behind(rise_m: float) -> None:
+    outwards = np.arange(-14, 30) * 0.01
+    level = np.where(outwards > 0.08, rise_m, 0.0)
+    level[outwards > 0.175] = -np.inf
+    fall_m = _flank(outwards, level, 0.0, 0.28)[1]
+    assert fall_m == pytest.approx(-rise_m)
+
+
 def test_a_side_that_nothing_shows_to_end_may_go_on() -> None:
     """Two outlines that share a bundle miss each other's part: half a width, on one side each."""
     nothing = Reading(cast(FittedOutline, None), 1.0, None, 0.0, None)

@@ -189,6 +189,8 @@ def _look_at(picture: WindowPicture, window: BundleWindow, bundle: Bundle, eyes_
     for side in (-1, 1):
         flank = bundle.width_m * (0.5 + _FLANK_RATIO * max(0.0, float((side * tilts).max()))) + _OFF_FLANK_M
         there = (side * beside >= flank) & (side * beside < flank + _LOOKED_AT_M)
+        if not there.any():
+            return _View(0.0, np.inf, _End(np.inf, 0.0), _End(np.inf, 0.0))
         ends.append(_end(level[:, there], beside[there], along, row_m, crest_level))
     flat = np.ptp(level[max(middle - _FLAT_ROWS, 0) : middle + _FLAT_ROWS + 1, crest].mean(axis=1))
     return _View(_ROW_M * (last - first), float(flat), ends[0], ends[1])

@@ -118,7 +118,8 @@ def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tup
     """Measure one side from the crest (m): the fall before its edge; the fall including what a map extends
     over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank
     or nothing was measured beside it; and the rise of what lies beyond, NaN where nothing was measured. What
-    stands behind a place that is deeper than the bundle can't lie over it.
+    stands behind a place that is deeper than the bundle can't lie over it, but what goes on over the edge
+    before such a place may.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]
@@ -134,5 +135,6 @@ def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tup
     rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
     seen = own[~np.isnan(own)]
     lowest = seen.min() if seen.size else crest if own.size and rise > _HIGHER_M else -np.inf
-    fall = np.inf if end < last + _BESIDE_M else crest - lowest
+    goes_on = np.isfinite(level[(outwards >= last) & (outwards < end)]).any()
+    fall = np.inf if end < last + _BESIDE_M and not goes_on else crest - lowest
     return float(before), float(fall), float(rise)
