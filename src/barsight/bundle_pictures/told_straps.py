@@ -36,7 +36,7 @@ from barsight.yard.types import Bundle, DoubtKind, HeightMap, YardMap
 _STEP_M, _ROW_M = 0.004, 0.003
 """Spacing of the samples across and along the bundle."""
 _BESIDE_M, _ALONG_M = 0.13, 0.13
-"""How far a window reaches beyond the flanks, and along the bundle to either side of a line."""
+"""Reach (m) of a window beyond the flanks, and along the bundle to either side of a line."""
 _FRAMES, _LINES = 4, 6
 """Number of nearest frames in which a line is looked at, and maximum number of lines on a bundle."""
 _MAX_PIXEL_M = 0.007

@@ -51,8 +51,8 @@ class StraightSections:
     unknown. The rows of a bowed bundle are shifted sideways into line.
 
     unsure_m: by how much each height's sigma exceeds the bundle's median one. views: (R, C), how many tell a
-    height, inf where that isn't known. axis_z_m: height of its axis.
-    outline_z_m: that of the fitted outline's top.
+    height, inf where that isn't known. axis_z_m: height of its axis. outline_z_m: that of the fitted
+    outline's top.
     """
 
     z_m: Float64

@@ -81,8 +81,8 @@ class SeenSection:
 
     width_m: from side to side, with its sigma. misfit_m: RMS of the mean section over the outline of a full
     hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
-    both fall to the floor. hidden_m: length out of sight behind the low and the high side. middle_m: place
-    midway between the sides, beside the outline's axis.
+    sides_free: both fall to the floor. hidden_m: length out of sight behind the low and the high side.
+    middle_m: place midway between the sides, beside the outline's axis.
     """
 
     width_m: float
